@@ -172,12 +172,11 @@ def test_simulated_never_installs_on_a_real_cell(small_session_file: Path, tmp_p
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("profile", ["robust", "paper"])
-def test_the_same_bits_in_two_processes(session_file: Path, tmp_path: Path, profile: str) -> None:
+def test_the_same_bits_in_two_processes(session_file: Path, tmp_path: Path) -> None:
     """Whatever the threads; the lens is found from the pictures too. Only the date may differ."""
     for threads, name in (("1", "a.yaml"), ("3", "b.yaml")):
         words = ["solve", str(session_file), "-o", str(tmp_path / name), "--threads", threads]
-        command = [sys.executable, "-m", "calibrate.cli", *words, "--profile", profile]
+        command = [sys.executable, "-m", "calibrate.cli", *words]
         done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
         assert done.returncode in (0, 4), done.stderr
     first, second = ((tmp_path / name).read_text().splitlines() for name in ("a.yaml", "b.yaml"))

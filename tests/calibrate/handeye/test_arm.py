@@ -35,7 +35,7 @@ def without_joints(views: ViewSet) -> ViewSet:
 def test_table_errors_are_found_and_coverage_comes_back():
     rng = np.random.default_rng(0)
     held = {"with": 0, "without": 0}
-    for _ in range(3):
+    for _ in range(2):
         worn = worn_cell(rng, 0.4)
         found, plain = solve_views(worn.views, QUICK), solve_views(worn.views, WITHOUT)
         assert found.arm.log_bayes > 3 and found.arm.detected
@@ -45,13 +45,13 @@ def test_table_errors_are_found_and_coverage_comes_back():
         assert found.rejected == ()
         held["with"] += inside(found, worn.X)
         held["without"] += inside(plain, worn.X)
-    assert held["with"] == 3 > held["without"]
+    assert held["with"] == 2 > held["without"]
 
 
 def test_a_good_arm_is_not_accused_and_costs_little():
     rng = np.random.default_rng(1)
     prices = []
-    for _ in range(3):
+    for _ in range(2):
         worn = worn_cell(rng, 0.0)
         found, plain = solve_views(worn.views, QUICK), solve_views(worn.views, WITHOUT)
         assert found.arm.log_bayes < 3 and not found.arm.detected
@@ -152,9 +152,9 @@ def test_an_unknown_or_impossible_arm_is_learned_from_its_joints_alone(model):
     ("name", "mount"), [("spherical wrist", "eye-in-hand"), ("seven joints", "eye-to-hand")]
 )
 def test_an_arm_nobody_described_is_honest_and_better_by_its_joints(name, mount):
-    """Links off by 0.3 mm and mrad, 3 cells each; `benchmarks/results/any_arm.md` has more."""
+    """Links off by 0.3 mm and mrad, 2 cells each; `benchmarks/results/any_arm.md` has more."""
     covered, errors = [], []
-    for seed in range(3, 6):
+    for seed in range(3, 5):
         cell = arm_cell(name, mount, 0.3, seed)
         solved = [solve_views(cell.views, replace(QUICK, model_arm=arm)) for arm in (True, False)]
         covered.append(inside(solved[0], cell.X))

@@ -64,8 +64,10 @@ def test_a_pose_that_was_copied_is_no_swap():
     assert (rejected.index, rejected.kind) == (4, "inconsistent")
 
 
-@MOUNTS
-@pytest.mark.parametrize(("number", "size"), [(0, -0.02), (2, 8e-3), (4, 0.02)])
+@pytest.mark.parametrize(
+    ("mount", "number", "size"),
+    [("eye-in-hand", 0, -0.02), ("eye-to-hand", 2, 8e-3), ("eye-in-hand", 4, 0.02)],
+)
 def test_one_wrong_number_is_named_with_axis_and_size(mount, number, size):
     c = make_cell(np.random.default_rng(3), 14, MID, mount=mount)
     slip = size * np.eye(6)[number]
@@ -103,36 +105,31 @@ def test_the_farther_off_a_view_the_less_it_counts_and_doubt_is_said():
 
 @pytest.mark.parametrize("share", [0.12, 0.4])
 def test_shuffled_poses_cost_hardly_more_than_their_views(share):
-    ours, oracle = [], []
-    for seed in range(2):
-        c = cell(seed, 25)
-        bad = np.random.default_rng(seed).choice(25, round(25 * share), replace=False)
-        flange = c.views.base_from_flange
-        flange[bad] = flange[np.roll(bad, 1)]
-        solution = solve_views(with_flange(c.views, flange), QUICK)
-        assert not set(bad) & set(solution.used)
-        good = [i for i in range(25) if i not in set(bad)]
-        ours.append(error_mm_deg(solution.matrix, c.X)[0])
-        oracle.append(error_mm_deg(solve_views(c.views.select(good), QUICK).matrix, c.X)[0])
-        gates = {gate.name: gate.passed for gate in judge(solution)}
-        assert gates["weight"] == (share < 0.2)
-    assert np.mean(ours) < 1.15 * np.mean(oracle)
+    c = cell(0, 25)
+    bad = np.random.default_rng(0).choice(25, round(25 * share), replace=False)
+    flange = c.views.base_from_flange
+    flange[bad] = flange[np.roll(bad, 1)]
+    solution = solve_views(with_flange(c.views, flange), QUICK)
+    assert not set(bad) & set(solution.used)
+    oracle = solve_views(c.views.select([i for i in range(25) if i not in set(bad)]), QUICK)
+    assert error_mm_deg(solution.matrix, c.X)[0] < 1.15 * error_mm_deg(oracle.matrix, c.X)[0]
+    gates = {gate.name: gate.passed for gate in judge(solution)}
+    assert gates["weight"] == (share < 0.2)
 
 
-@pytest.mark.parametrize("kind", ["every number", "one number"])
-def test_forty_percent_of_moderate_errors_stay_inside_the_claim(kind):
+def test_forty_percent_of_moderate_errors_stay_inside_the_claim():
     """6 to 20 robot sigmas: where views cannot be told apart, the noise that is claimed is that of all."""
     held = 0
-    for seed in range(3):
+    for seed in range(4):
         rng = np.random.default_rng([seed, 40])
         c = make_cell(rng, 25, MID)
         bad = rng.choice(25, 10, replace=False).tolist()
         size = rng.uniform(6, 20, (10, 6)) * rng.choice([-1, 1], (10, 6))
-        if kind == "one number":
+        if seed % 2:  # of one number only
             size = size * np.eye(6)[rng.integers(6, size=10)]
         solution = solve_views(nudged(c.views, bad, size * SIGMA), QUICK)
         held += inside(solution, c.X)
-    assert held >= 2
+    assert held >= 3
 
 
 def test_views_without_corners_have_only_a_robot():

@@ -9,17 +9,13 @@ the solution; None: it is not judged. A new figure is a field of `handeye.soluti
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
 
-from calibrate.errors import UsageError
 from calibrate.handeye.solution import Reading, Solution
 from calibrate.results import Gate, Sense
-from recordings import strict_yaml
-from recordings.files import read_file
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -56,16 +52,6 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     is at most 0.04 mm at one metre."""
     robot_error_m: float | None = 0.002
     robot_error_deg: float | None = 0.3
-
-
-def read_limits(path: Path) -> GateLimits:
-    """Read YAML with some of GateLimits' fields. Raises UsageError naming file and field."""
-    try:
-        return strict_yaml.load(read_file(path, strict_yaml.LIMIT_BYTES), GateLimits)
-    except (OSError, strict_yaml.StrictYamlError) as problem:
-        names = ", ".join(GateLimits.__struct_fields__)
-        said = problem.strerror if isinstance(problem, OSError) else problem
-        raise UsageError("gate-limits", path=path, problem=str(said), names=names) from None
 
 
 def judge(

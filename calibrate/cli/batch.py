@@ -16,10 +16,10 @@ from calibrate.batch.cluster import cluster_workers
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
+from calibrate.cli.files import read_limits
 from calibrate.cli.output import AsJson, err, out
 from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit
 from calibrate.errors import UsageError
-from calibrate.gates import GateLimits, read_limits
 from calibrate.job import JobOptions
 from calibrate.recorded_views import Progress as LoadProgress
 from recordings.cli.console import progress_bar
@@ -57,8 +57,7 @@ def batch(
     if scheduler is not None and workers is not None:
         raise UsageError("options", why="--workers counts processes here, not on a cluster", advice="")
     work = pool(workers) if scheduler is None else cluster_workers(scheduler)
-    gate_limits = GateLimits() if gates is None else read_limits(gates)
-    options = JobOptions(profile=profile, seed=seed, limits=gate_limits)
+    options = JobOptions(profile=profile, seed=seed, limits=read_limits(gates))
     limits = Limits(time_limit_s, memory_limit_mib)
     with _stoppable("solving") as bar:
         told = None if bar is None else lambda done, total, result: bar(done, total, result.session)

@@ -1,4 +1,4 @@
-"""Boards and cameras from files that a person names on the command line."""
+"""Boards, cameras and limits from files that a person names on the command line."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from calibrate.boards.model import check_board
 from calibrate.errors import UsageError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.proof import FORMATS
+from calibrate.gates import GateLimits
 from calibrate.lens.intrinsics import LensModel
 from calibrate.projection import camera_matrix, distortion
 from recordings import strict_yaml
@@ -26,6 +27,11 @@ def read_board(path: Path) -> BoardSpec:
     board = _strictly(path, BoardSpec, "board")
     check_board(board)
     return board
+
+
+def read_limits(path: Path | None) -> GateLimits:
+    """Read some of the gates' limits; None: the defaults."""
+    return GateLimits() if path is None else _strictly(path, GateLimits)
 
 
 def read_camera(path: Path) -> tuple[CameraModel, dict[str, float]]:
@@ -71,7 +77,7 @@ def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
         raise UsageError("input-file", path=path, why=f"not a whole camera_info file ({problem!r})") from None
 
 
-def _strictly(path: Path, kind: type[T], under: str) -> T:
+def _strictly(path: Path, kind: type[T], under: str = "") -> T:
     try:
         return strict_yaml.load(_content(path), kind, under)
     except strict_yaml.StrictYamlError as error:

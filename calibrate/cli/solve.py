@@ -15,7 +15,7 @@ from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.cli.contracts import CompareJson, SolveJson
-from calibrate.cli.files import read_board, read_camera
+from calibrate.cli.files import read_board, read_camera, read_limits
 from calibrate.cli.output import (
     AsJson,
     OpenReport,
@@ -39,7 +39,6 @@ from calibrate.errors import UsageError
 from calibrate.files.calibration import write_calibration, write_output
 from calibrate.files.formatting import summary
 from calibrate.files.install import install_line
-from calibrate.gates import GateLimits, read_limits
 from calibrate.geometry import roll_pitch_yaw
 from calibrate.handeye.solution import camera_frames
 from calibrate.job import JobOptions, SolvedRecording
@@ -102,7 +101,7 @@ def solve(
         find_intrinsics=find_intrinsics,
         without=_numbers(without),
         threads=threads,
-        limits=GateLimits() if gates is None else read_limits(gates),
+        limits=read_limits(gates),
         working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
         robot_accuracy_m=None if robot_accuracy_mm is None else robot_accuracy_mm / 1000,
         robot_accuracy_rad=None if robot_accuracy_deg is None else math.radians(robot_accuracy_deg),

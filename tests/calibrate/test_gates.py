@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.cli.files import read_limits
 from calibrate.errors import UsageError
 from calibrate.files.formatting import figures
-from calibrate.gates import GateLimits, judge, read_limits
+from calibrate.gates import GateLimits, judge
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solution import Explanation, Finding, Reading, Solution
 from calibrate.job import SolvedRecording
@@ -145,9 +146,9 @@ def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution
 def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) -> None:
     path = tmp_path / "gates.yaml"
     path.write_text(content)
-    with raises("gate-limits", UsageError, path=str(path)):
+    with raises("input-file", UsageError, path=str(path)):
         read_limits(path)
-    with raises("gate-limits", UsageError):
+    with raises("input-file", UsageError):
         read_limits(tmp_path / "none.yaml")
 
 

@@ -46,7 +46,7 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
         ("-o", "no/such/c.yaml", "output", "no/such"),
         ("--report", "no/such/r.html", "output", "no/such"),
         ("--board", "board.yaml", "input-file", "line 1", "kind", "line 2", "colums", "columns"),
-        ("--gates", "gates.yaml", "gate-limits", "gates.yaml", "view"),
+        ("--gates", "gates.yaml", "input-file", "gates.yaml", "view"),
         ("--camera", "camera.yaml", "input-file", "camera_info"),
         ("--square-mm", "-4", "board-impossible", "square_m"),
         ("--profile", "nix", "", "robust"),

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
 from calibrate.geometry import Array, difference, is_rigid, pose, project_to_rotation, rotation_angle, skew
-from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses, screw_invariants
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses, screw_invariants
 from calibrate.projection import camera_matrix, distortion
 from calibrate.results import HoldoutScore
 from calibrate.views import BoardView, ViewSet, require_no_copies
@@ -218,17 +218,10 @@ class HeldOut:
     pairs: Pairs
 
 
-def held_out(views: ViewSet, paper: bool) -> HeldOut | None:
-    """Hold out all pairs inside the last 6 views, or the paper's samples, the last 6 consecutive pairs.
-
-    None for too few views.
-    """
+def held_out(views: ViewSet) -> HeldOut | None:
+    """Hold out all pairs inside the last 6 views; None for too few views."""
     fitted = len(views) - HELD_OUT
     if fitted < FEWEST_FITTED:
         return None
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
-    if paper:
-        pairs = consecutive_pairs(H, C).select(slice(fitted - 1, None))
-    else:
-        pairs = all_pairs(H[fitted:], C[fitted:])
-    return HeldOut(views.select(list(range(fitted))), pairs)
+    return HeldOut(views.select(list(range(fitted))), all_pairs(H[fitted:], C[fitted:]))

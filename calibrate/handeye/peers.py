@@ -57,28 +57,18 @@ _EXACT = 1e-6
 def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[PeerResult]:
     """Run every method, ours last. All get the views that ours keeps (turned boards set right), with the
     board poses of the given intrinsics; e_t and e_R are scored on the last 6 of them, fitted without.
-
-    With the paper's profile all get every view, as the paper's method does, and are scored on its samples.
     """
     require_solvable(views)
     options = options or SolveOptions()
-    paper = options.profile == "paper"
-    options = replace(options, profile="robust")
     start = time.perf_counter()
     ours = solve_robust_profile(views, options)
     ours_ms = 1e3 * (time.perf_counter() - start)
-    kept = views if paper else replace(views, views=ours.kept)
-    held = held_out(kept, paper)
+    kept = replace(views, views=ours.kept)
+    held = held_out(kept)
     rows = [_row(name, method, kept, held, ours) for name, method in _methods(options).items()]
     final = _scored("ours", ours.matrix, kept, ours)
-    if paper and held is not None:
-        final = _with_samples(final, _ours_without(held.fitted, options), held.pairs)
-    elif ours.holdout is not None:
-        final = replace(
-            final,
-            e_t_m=ours.holdout.e_t_m,
-            e_R=ours.holdout.e_R,
-        )
+    if ours.holdout is not None:
+        final = replace(final, e_t_m=ours.holdout.e_t_m, e_R=ours.holdout.e_R)
     return [*rows, replace(final, time_ms=ours_ms, note="time with held-out scores, outliers and proof")]
 
 
@@ -136,19 +126,12 @@ def _pose_arrays(views: ViewSet) -> tuple[Array, Array]:
     return mount_poses(views.base_from_flange, views.mount), views.camera_from_board
 
 
-def _ours_without(fitted: ViewSet, options: SolveOptions) -> Array | None:
-    try:
-        return solve_robust_profile(fitted, replace(options, holdout=False)).matrix
-    except CalibrationError:
-        return None
-
-
 def _row(name: str, method: Method, views: ViewSet, held: HeldOut | None, ours: Solution) -> PeerResult:
     start = time.perf_counter()
     try:
         X = method(views)
         elapsed_ms = 1e3 * (time.perf_counter() - start)
-        partial_X = None if held is None else method(held.fitted)
+        partial_X = X if held is None else method(held.fitted)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError, ValueError) as error:
         return PeerResult(name, None, note=f"failed: {str(error).splitlines()[0]}")
     if not np.isfinite(X).all():
@@ -156,7 +139,10 @@ def _row(name: str, method: Method, views: ViewSet, held: HeldOut | None, ours: 
     row = replace(_scored(name, X, views, ours), time_ms=elapsed_ms)
     if name == PAPER and (boxed := on_box(np.append(rotation_log(X[:3, :3]), X[:3, 3]))):
         row = replace(row, on_box=boxed, note=f"on the paper's box ({', '.join(boxed)}): X is wrong")
-    return row if held is None else _with_samples(row, partial_X, held.pairs)
+    if held is None or not np.isfinite(partial_X).all():
+        return row
+    e_t, e_R = motion_errors(partial_X, held.pairs)
+    return replace(row, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()))
 
 
 def _scored(name: str, X: Array, views: ViewSet, ours: Solution) -> PeerResult:
@@ -173,14 +159,6 @@ def _scored(name: str, X: Array, views: ViewSet, ours: Solution) -> PeerResult:
         rigid=rigid,
         note="" if rigid else "raw matrix, not a rigid transform",
     )
-
-
-def _with_samples(row: PeerResult, partial_X: Array | None, pairs: Pairs) -> PeerResult:
-    """Add e_t and e_R of an X (4, 4) that was fitted without these pairs."""
-    if partial_X is None or not np.isfinite(partial_X).all():
-        return row
-    e_t, e_R = motion_errors(partial_X, pairs)
-    return replace(row, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()))
 
 
 def reprojection_px(views: ViewSet, X: Array) -> float | None:

@@ -43,8 +43,8 @@ def test_the_camera_is_found_with_an_unknown_lens(solved: SolvedRecording) -> No
     assert solved.intrinsics is not None
     assert solved.calibration.intrinsics.matrix[0][0] == pytest.approx(620.0, rel=0.005)
     assert solved.calibration.source == "simulated"
-    (coverage,) = (gate.value for gate in solved.gates if gate.name == "coverage")
-    assert coverage is not None and 0.2 < coverage < 0.95
+    told = {gate.name: gate.value or 0.0 for gate in solved.gates}
+    assert 0.2 < told["coverage"] < 0.95 and told["clock_bound_s"] == 0.001
 
 
 def test_a_symmetric_board_solves_by_the_robots_motion(tmp_path: Path) -> None:

@@ -51,15 +51,6 @@ def test_columns_are_filled_and_ours_is_the_reference():
     )
 
 
-def test_with_the_papers_profile_all_are_scored_on_the_papers_own_samples():
-    """18 pairs to solve and 6 to score of 25 views: the curves 4 and 5 have the same samples."""
-    cell = make_cell(np.random.default_rng(1), 25, MID)
-    published = solve_views(cell.views, SolveOptions(profile="paper"))
-    rows = {row.name: row for row in compare_all(cell.views, SolveOptions(profile="paper"))}
-    assert rows["DE, paper"].e_t_m == published.holdout.e_t_m
-    assert rows["DE, paper"].e_R == published.holdout.e_R
-
-
 def test_the_papers_row_says_when_its_answer_lies_on_the_box():
     beyond = pose(rotation_exp([0.1, 0.2, 0.0]), [1.25, 0.0, 0.6])
     cell = make_cell(np.random.default_rng(1), 12, MID, mount="eye-to-hand", X=beyond)

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boards
+from calibrate.imported.board import FEWEST, GUESSED_M, Key, Seen, see_board, told_boards
 from calibrate.imported.mounting import joints_of, joints_rad, mounting
 from calibrate.imported.readings import Reading, decide, is_good, readings
 from recordings.errors import ImportSourceError
@@ -70,15 +70,18 @@ def believe(
         if told.poses is not None and given == Given():
             return _as_before(lies, told, told.poses)
         given = Given(given.convention, given.mount or told.mount, given.board or told.board)
-    robots = [t for t in lies.tables if t.whose == "robot"] or [t for t in lies.tables if not t.whose]
+    named, unnamed = ([t for t in lies.tables if t.whose == whose] for whose in ("robot", ""))
+    robots = (named or unnamed) if lies.told is None else lies.told
     boards = [
         (robot, board, pairs)
         for robot in robots
         for board in lies.tables
-        if board.whose == "board" and len(pairs := _pairs(robot, board)) >= FEWEST
+        if (board.whose == "board" or (lies.told and board in unnamed)) and board not in robots
+        if len(pairs := _pairs(robot, board)) >= FEWEST
     ]
     tried: list[Reading] = []
     families: list[str] = []
+    seen: Seen | None = None
     for family in sorted(lies.images, key=lambda name: (bool(_MADE.search(name)), name)):
         paired = [(table, _pairs(table, lies.images[family])) for table in robots]
         paths = {path for _, pairs in paired if len(pairs) >= FEWEST for path in pairs}
@@ -95,28 +98,14 @@ def believe(
         for n, (robot, board, pairs) in enumerate(boards):
             progress(n, len(boards), "comparing tables of poses")
             tried += readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
-    if not families and not boards:
+    if not tried and (seen or not families):
         there = [f"{len(paths)} {name}" for name, paths in lies.images.items()]
         tables = [f"{len(table.numbers)} {table.name}" for table in lies.tables]
         said = [", ".join(each[:8]) or "none" for each in (there, tables)]
         raise ImportSourceError("no-pairs", source=lies.root, images=said[0], tables=said[1])
-    if not tried and not boards:
+    if not tried:
         raise ImportSourceError("no-board-found", source=lies.root, images=", ".join(families))
-    if given.convention and not any(map(is_good, tried)):
-        _name_convention(lies, given, progress)
-    return _believed(lies, given, decide(lies, tried))
-
-
-def _name_convention(lies: Lies, given: Given, progress: Progress) -> None:
-    """Refuse the convention that was named where the poses fit by another one."""
-    try:
-        others = believe(lies, Given(None, given.mount or "eye-in-hand", given.board), None, progress)
-    except ImportSourceError:
-        return
-    fits = others.dataset.poses.convention if others.dataset.poses else ""
-    if given.mount is None:  # then the direction is open
-        fits = fits.removesuffix("-inverse")
-    raise ImportSourceError("other-convention", source=lies.root, told=given.convention, fits=fits)
+    return _believed(lies, given, decide(lies, tried, given.convention, given.mount))
 
 
 def _as_before(lies: Lies, told: Dataset, poses: PosesTold) -> Believed:

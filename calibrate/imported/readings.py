@@ -22,6 +22,7 @@ from recordings.importers.conventions import Convention, convention, possible
 from recordings.importers.tables import Lies, Table
 from recordings.schema.messages import Mount
 
+_AS_TOLD = "as told"
 _MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 _MOST = 12
 """Most readings of one table that are fitted: those by which the board seems to move least."""
@@ -58,22 +59,28 @@ class Reading:
 def readings(
     table: Table, family: str, pairs: dict[Key, int], seens: list[Seen], named: str | None
 ) -> Iterator[Reading]:
-    """Yield the best readings that the views can judge; `named`: the convention that the user gives."""
+    """Yield the best readings that the views can judge; `named`: the convention that the user gives, beside
+    which the others are tried all the same."""
+    asked = None if named is None else convention(named)
     likely: list[tuple[float, int, Convention, str, Array, Seen, list[Key], Mount]] = []
     for seen in seens:
         keys = [key for key in seen.views if key in pairs]
         if len(keys) < FEWEST:
             continue
         numbers = table.numbers[[pairs[key] for key in keys]]
-        told = [(convention(named), "as told")] if named else possible(numbers)
-        spelt = [each for each in told if table.rotation and each[0].rotation == table.rotation]
-        for how, evidence in spelt or told:
+        ways = possible(numbers)
+        spelt = [way for way in ways if table.rotation and way[0].rotation == table.rotation]
+        ways = [way for way in spelt or ways if way[0] != asked]
+        for how, evidence in ways if asked is None else [(asked, _AS_TOLD), *ways]:
             flange = how.poses(numbers)
             likely += [
                 (_moves(seen, keys, flange, mount), len(likely), how, evidence, flange, seen, keys, mount)
                 for mount in _MOUNTS
             ]
-    for _, _, how, evidence, flange, seen, keys, mount in sorted(likely, key=lambda each: each[:2])[:_MOST]:
+    likely.sort(key=lambda each: each[:2])
+    as_told = [each for each in likely if each[3] == _AS_TOLD]
+    others = [each for each in likely if each[3] != _AS_TOLD]
+    for _, _, how, evidence, flange, seen, keys, mount in as_told[:_MOST] + others[:_MOST]:
         fitted = _fitted(seen, keys, flange, mount)
         if fitted is not None:
             yield Reading(table, how, family, pairs, seen, mount, *fitted, evidence)
@@ -147,19 +154,31 @@ def is_good(reading: Reading) -> bool:
     )
 
 
-def decide(lies: Lies, readings: list[Reading]) -> Reading:
-    good = [reading for reading in readings if is_good(reading)] or readings
-    ranked = sorted(good, key=lambda r: -r.fit.log_evidence)
-    if not ranked or not is_good(ranked[0]):
-        raise ImportSourceError("no-reading", source=lies.root, **_nearest(ranked[:_EXPLAINED]))
-    best = ranked[0]
-    for other in ranked[1:]:
-        if best.fit.log_evidence - other.fit.log_evidence > clear_gain(len(best.fit.full)):
+def decide(lies: Lies, readings: list[Reading], named: str | None, mount: Mount | None) -> Reading:
+    """The reading that is clearly best. What the user names is refused where another one is clearly better;
+    whose mounting and convention are told needs not agree well: the solve judges it."""
+    ranked = sorted(readings, key=lambda r: (not is_good(r), -r.fit.log_evidence))
+    mine = [reading for reading in ranked if named is None or reading.told == _AS_TOLD]
+    beaten = mine and _beats(ranked[0], mine[0])
+    if beaten and is_good(ranked[0]):
+        fits = replace(ranked[0].convention, inverse=mount not in (None, ranked[0].mount)).name
+        raise ImportSourceError("other-convention", source=lies.root, told=named, fits=fits)
+    if not mine or beaten or not is_good(mine[0]):
+        nearest = _nearest([*dict.fromkeys(ranked[:_EXPLAINED] + mine[:_EXPLAINED])])
+        if not mine or beaten or not (named and mount) or nearest["cause"]:
+            raise ImportSourceError("no-reading", source=lies.root, **nearest)
+    best = mine[0]
+    for other in mine[1:]:
+        if _beats(best, other) or is_good(other) != is_good(best):
             break
-        if other.mount != best.mount or not _same(best, other):
+        if not _same(best, other):
             both = {"first": best.text, "second": other.text}
             raise ImportSourceError("two-readings", source=lies.root, **both)
     return best
+
+
+def _beats(one: Reading, other: Reading) -> bool:
+    return one.fit.log_evidence - other.fit.log_evidence > clear_gain(len(one.fit.full))
 
 
 def _nearest(readings: list[Reading]) -> dict[str, Any]:
@@ -169,13 +188,11 @@ def _nearest(readings: list[Reading]) -> dict[str, Any]:
         found = explain_recording(_pose_views(reading.views, reading.seen))
         gain = found.log_evidence_gain if found.reading in _CAUSES else 0.0
         ranked.append((-reading.fit.log_evidence - gain, n, reading, found))
-    if not ranked:
-        return {"nearest": "none", "stays_m": 0.0, "stays_rad": 0.0, "cause": "", "text": ""}
     _, _, best, found = min(ranked, key=lambda each: each[:2])
     near = {"nearest": best.text, "stays_m": best.stays_m, "stays_rad": best.stays_rad}
     if found.reading not in _CAUSES:
         return {**near, "cause": "", "text": ""}
-    return {**near, "cause": found.reading.value, "text": explain_text(found, best.views)}
+    return {**near, "cause": found.reading.value, "text": ". " + explain_text(found, best.views).rstrip(".")}
 
 
 _CAUSES = (NamedReading.SHIFTED, NamedReading.MIRRORED, NamedReading.BOARD_MOVED, NamedReading.CAMERA_MOVED)
@@ -183,16 +200,13 @@ _CAUSES = (NamedReading.SHIFTED, NamedReading.MIRRORED, NamedReading.BOARD_MOVED
 
 
 def _same(one: Reading, other: Reading) -> bool:
-    """Tell whether two readings are the same poses, in other words."""
+    """Tell whether two readings are the same poses, in other words; of boards perhaps told the other way."""
     a, b = (reading.convention.poses(reading.table.numbers) for reading in (one, other))
-    boards = [reading.seen.candidates for reading in (one, other) if reading.seen is not one.seen]
-    seen = one.seen.candidates
-    return (
-        a.shape == b.shape
-        and bool(np.abs(a - b).max() < 1e-3)
-        and all(
-            np.abs(seen[key][0].camera_from_board - told[key][0].camera_from_board).max() < 1e-3
-            for told in boards
-            for key in seen.keys() & told.keys()
-        )
-    )
+    if a.shape != b.shape or np.abs(a - b).max() > 1e-3:
+        return False
+    turned, c, d = one.mount != other.mount, one.seen.candidates, other.seen.candidates
+    keys = c.keys() & d.keys()
+    if one.seen is other.seen or not keys:
+        return not turned
+    ours, theirs = (np.array([each[key][0].camera_from_board for key in keys]) for each in (c, d))
+    return bool(np.abs(ours - (inverse(theirs) if turned else theirs)).max() < 1e-3)

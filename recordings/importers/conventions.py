@@ -22,6 +22,8 @@ _REACH_LIMIT_M = 5.0
 _REACH_LEAST_M = 0.01
 """A smaller one is no arm's in the unit that makes it so."""
 _UNIT_TOLERANCE = 0.01
+_TURN = 2 * math.pi + 0.01
+"""Larger numbers are no angles in radians."""
 
 
 @dataclass(frozen=True)
@@ -120,24 +122,27 @@ def possible(numbers: Array) -> list[tuple[Convention, str]]:
         miss = float(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max())
         right = miss < 0.02 and bool((np.linalg.det(R) > 0).all())
         found = [(Convention("matrix"), f"rows at right angles within {miss:.1g}")] if right else []
-        at = numbers[:, 3:12:4]
-    elif k == 7:
-        miss = float(np.abs(np.linalg.norm(numbers[:, 3:], axis=1) - 1).max())
+        return _in_units(found, numbers[:, 3:12:4])
+    turn_first = _rotations(numbers[:, :-3]) if k == 7 or np.abs(numbers[:, -3:]).max() > _TURN else []
+    behind = [
+        (replace(how, rotation_first=True), evidence) for how, evidence in turn_first if not how.degrees
+    ]
+    return _in_units(_rotations(numbers[:, 3:]), numbers[:, :3]) + _in_units(behind, numbers[:, -3:])
+
+
+def _rotations(turn: Array) -> list[tuple[Convention, str]]:
+    if turn.shape[1] == 4:
+        miss = float(np.abs(np.linalg.norm(turn, axis=1) - 1).max())
         near = f"quaternions of length 1 within {miss:.1g}"
-        found = [(Convention(form), near) for form in ("xyzw", "wxyz") if miss < _UNIT_TOLERANCE]
-        at = numbers[:, :3]
-    else:
-        largest, at = float(np.abs(numbers[:, 3:]).max()), numbers[:, :3]
-        forms = ("rotvec", "xyz", "ZYX", *(s for s in _SEQUENCES if s not in ("xyz", "ZYX")))
-        unit = largest > 2 * math.pi + 0.01  # in degrees an arm that turns so little shows nothing
-        found = [
-            (
-                Convention(form, degrees=unit),
-                f"angles to {largest:.4g} {'°' if unit else 'rad'}",
-            )
-            for form in forms
-            if unit or form != "rotvec" or largest <= math.pi + 0.01
-        ]
+        return [(Convention(form), near) for form in ("xyzw", "wxyz") if miss < _UNIT_TOLERANCE]
+    largest = float(np.abs(turn).max())
+    forms = ("rotvec", "xyz", "ZYX", *(s for s in _SEQUENCES if s not in ("xyz", "ZYX")))
+    unit = largest > _TURN  # in degrees an arm that turns so little shows nothing
+    evidence = f"angles to {largest:.4g} {'°' if unit else 'rad'}"
+    return [(Convention(form, degrees=unit), evidence) for form in forms]
+
+
+def _in_units(found: list[tuple[Convention, str]], at: Array) -> list[tuple[Convention, str]]:
     reach = float(np.median(np.linalg.norm(at, axis=1)))
     unit_m = _MM if reach > _REACH_LIMIT_M else 1.0
     if reach * unit_m < _REACH_LEAST_M:

@@ -12,7 +12,7 @@ import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -21,6 +21,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import yaml
+from scipy.io import loadmat
 
 from recordings import strict_yaml
 from recordings.files import read_file
@@ -32,9 +33,13 @@ _YAML = (".yaml", ".yml", ".samples", ".calib")
 _SUFFIXES = (*_YAML, ".json", ".xml", ".csv", ".txt", ".dat", ".toml", ".tsv", ".script")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 _IMAGE = re.compile(rf"[^\s,;'\"\[\]]+(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))})\b", re.I)
-_POSE_SIZES = (6, 7, 12, 16)
-_POSITION = re.compile(r"pos|position|trans\w*|tvec|t|xyz|p|location")
-_ROTATION = re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues")
+_POSE_SIZES = (6, 7, 12, 16, 8, 13, 17)
+"""The last three with a time stamp or a running number before them."""
+_HALVES = {
+    "position": (re.compile(r"pos|position|trans\w*|tvec|t|xyz|p|location"), (3,)),
+    "rotation": (re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues"), (3, 4, 9)),
+}
+"""Words of the two halves of a pose that are told apart, and how many numbers each has."""
 _COLUMNS = {
     "xyzw": ("qx", "qy", "qz", "qw"),
     "": ("rx", "ry", "rz"),
@@ -95,24 +100,26 @@ class Lies:
     """Values of leaves that describe a board, by lower-case key."""
     words: str = ""
     """The folder's last names, names of files and keys: what may say how the camera is mounted."""
+    told: list[Table] | None = None
+    """The robot's tables that the user names; None: none was named."""
 
 
 @dataclass
 class _Row:
     numbers: list[float]
-    rotation: str
     image: str
     place: tuple[int, ...]
+    told: bool
 
 
 def look(source: Path, poses: Path | None = None) -> Lies:
-    """Read what lies in `source`; tables only of `poses`, a file, a folder or the end of their names."""
-    file = poses if poses is not None and poses.exists() else None
+    """Read what lies in `source`; `poses` tells the robot's: a file, a folder or the end of their names."""
+    file = poses if poses is not None and poses.exists() else source / str(poses)
     found, rows = Lies(source), defaultdict[tuple[str, ...], list[_Row]](list)
     words = ["/".join(source.resolve().parts[-3:])]
     files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
     images = defaultdict[str, list[Path]](list)
-    for path in files if file is None or file.is_relative_to(source) else [*files, file]:
+    for path in files if file.is_relative_to(source) else [*files, file]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
             images[str(path.relative_to(source).parent / _pattern(path.name))].append(path)
             continue
@@ -127,24 +134,60 @@ def look(source: Path, poses: Path | None = None) -> Lies:
             words.extend(node.keys[-1:])
             if isinstance(node.value, str):
                 words.append(node.value[:60])
-            if file is not None and path != file and file not in path.parents:
-                continue
-            place = (*map(int, re.findall(r"\d+", name)), *node.place)
-            if (row := _pose(node.value)) is not None:
-                numbers, rotation, key = row
-                named = ".".join((*node.keys, key)).strip(".")
-                told[named, rotation, str(len(numbers))].append(_Row(numbers, rotation, node.image, place))
+            if (row := _pose(node.value) or _half(node)) is not None:
+                numbers, rotation, half = row
+                place = (*map(int, re.findall(r"\d+", name)), *node.place)
+                key = ".".join(node.keys), rotation, half, str(len(numbers))
+                told[key].append(_Row(numbers, node.image, place, file in (path, *path.parents)))
         for (named, *form), each in told.items():  # files of one row each make a table together
             rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
     found.images = dict(images)
+    found.told = None if poses is None else []
     found.words = " ".join(dict.fromkeys(words))
-    for (name, rotation, _), each in rows.items():
+    for name, rotation, each in _joined(rows):
         for part, some in _two_by_two(each).items():
-            if len(some) >= 3 and (poses is file or name.endswith(str(poses))):
+            table = _without_count(np.array([row.numbers for row in some]))
+            if len(some) >= 3 and table.shape[1] in (6, 7, 12, 16):
                 beside = [row.image for row in some], [row.place for row in some]
-                table = np.array([row.numbers for row in some])
                 found.tables.append(Table(f"{name}{part}", rotation, table, *beside))
+                if found.told is not None and (some[0].told or f"{name}{part}".endswith(str(poses))):
+                    found.told.append(found.tables[-1])
     return found
+
+
+def _joined(rows: dict[tuple[str, ...], list[_Row]]) -> Iterator[tuple[str, str, list[_Row]]]:
+    """(name, rotation, rows) of whole poses, then of halves: those named alike but for which half they are,
+    of the rest those that lie in the same place."""
+    yield from ((key[0], key[1], each) for key, each in rows.items() if not key[2])
+    left = {key: each for key, each in rows.items() if key[2]}
+    for alike in (_without_half, lambda name: re.split("[ .]", name)[:-1]):
+        halves = defaultdict[tuple[str, int], dict[str, tuple[str, ...]]](dict)
+        for key, each in left.items():
+            halves[str(alike(key[0])), len(each)].setdefault(key[2], key)
+        for both in halves.values():
+            if len(both) == 2:
+                at, turn = both["position"], both["rotation"]
+                path, _, last = at[0].replace(" ", ".").rpartition(".")
+                pairs = zip(left.pop(at), left.pop(turn), strict=True)
+                poses = [replace(p, numbers=_put_together(p.numbers, r.numbers)) for p, r in pairs]
+                yield at[0] if "_" in last else at[0][: len(path)], turn[1], poses
+
+
+def _without_half(name: str) -> list[str]:
+    return [word for word in re.split(r"[/_. #]+", name.lower()) if _half_of(word) is None]
+
+
+def _without_count(table: Array) -> Array:
+    """The table without a first column of time stamps or running numbers."""
+    first, columns = table[:, 0], table.shape[1]
+    rises = bool((np.diff(first) > 0).all()) and (columns != 7 or not np.any(first % 1))
+    return table[:, 1:] if rises and columns in (7, 8, 13, 17) else table
+
+
+def _put_together(at: list[float], turn: list[float]) -> list[float]:
+    if len(turn) == 9:
+        return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])]
+    return at + turn
 
 
 def _two_by_two(rows: list[_Row]) -> dict[str, list[_Row]]:
@@ -177,6 +220,9 @@ def read_tree(path: Path) -> Any:
     """A data file as dicts, lists, numbers and texts; None: no such file, or not readable as what it says."""
     suffix = path.suffix.lower()
     try:
+        if suffix == ".mat":
+            held = loadmat(BytesIO(read_file(path, _BYTES_LIMIT)))
+            return {key: value.tolist() for key, value in held.items() if not key.startswith("__")}
         if suffix in (".npy", ".npz"):
             content = read_file(path, _ARRAY_LIMIT_BYTES)  # larger: an image of depths
             loaded = np.load(BytesIO(content), allow_pickle=False)
@@ -208,14 +254,17 @@ def _of_xml(element: ElementTree.Element) -> Any:
 
 
 def _of_text(text: str) -> Any:
-    """Lines with as many numbers, and the same words, are rows; four of four numbers are a matrix."""
+    """Lines with as many numbers, and the same words, are rows; four of four numbers are a matrix.
+
+    Lines without words have those of the heading above them.
+    """
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(("#", "%"))]
     header = re.split(r"[,;\t]", lines[0]) if lines else []
     if len(header) >= 6 and not _NUMBER.search(lines[0]):
         names = [re.sub(r"\W.*", "", name.strip().lower()) for name in header]
         cells = [re.split(r"[,;\t]", line) for line in lines[1:]]
         return [dict(zip(names, map(_value, row), strict=False)) for row in cells]
-    groups = defaultdict[tuple[str, int], list[Any]](list)
+    groups, heading = defaultdict[tuple[str, int], list[Any]](list), ""
     for line in lines:
         image = _IMAGE.search(line)
         rest = line.replace(image[0], "") if image else line
@@ -223,6 +272,10 @@ def _of_text(text: str) -> Any:
         numbers = next((part for part in inside if len(part) in _POSE_SIZES), _numbers(rest))
         said = _NUMBER.sub("", re.sub(r"\[.*?\]", "", rest))
         label = " ".join(re.findall(r"[A-Za-z]\w*", said))[:40]
+        if not numbers and not image:
+            heading = label
+            continue
+        label = label or heading
         row = {"image": image[0], "pose": numbers} if image else numbers
         groups[label, len(numbers)].append(row)
     tree: dict[str, Any] = {}
@@ -258,14 +311,13 @@ class _Node:
 
 
 def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] = ()) -> Iterator[_Node]:
-    """The tree's nodes, those inside of a pose left out."""
-    yield _Node(tree, keys, place, image)
-    if isinstance(tree, list) and _pose(tree) is not None:
+    """The tree's nodes, those inside of a pose or of its half left out."""
+    yield (node := _Node(tree, keys, place, image))
+    if (isinstance(tree, list) or _is_matrix(tree)) and (_pose(tree) or _half(node)):
         return
     if isinstance(tree, dict):
         named = next((v for v in tree.values() if isinstance(v, str) and _IMAGE.fullmatch(v)), image)
-        for stem, parts in _stems(tree):
-            yield _Node(parts, (*keys, stem), place, named)
+        yield from (_Node(parts, (*keys, stem), place, named) for stem, parts in _stems(tree))
         for key, value in tree.items():
             digits = tuple(map(int, re.findall(r"\d+", str(key))))
             yield from _nodes(value, (*keys, _pattern(str(key))), named, (*place, *digits))
@@ -283,16 +335,14 @@ def _stems(tree: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         if part and part[1] and isinstance(value, (int, float)):
             groups[part[1]][part[2]] = value
     for stem, parts in groups.items():
-        value = list(parts.values()) if "".join(parts).isdigit() else parts
-        if _pose(value) is not None:
-            yield stem, value
+        yield stem, list(parts.values()) if "".join(parts).isdigit() else parts
 
 
 def _flat(value: Any) -> list[float] | None:
     """The numbers of a number, of lists of them, of {x, y, z, w} and of OpenCV's matrix."""
     if isinstance(value, dict):
         told = {str(key).lower(): each for key, each in value.items()}
-        if "data" in told and "rows" in told:
+        if _is_matrix(value):
             return _flat(told["data"])
         names = next((n for n in ("xyzw", "xyz") if set(n) == set(told)), "")
         return _flat([told[name] for name in names]) if names else None
@@ -302,10 +352,14 @@ def _flat(value: Any) -> list[float] | None:
     return [float(value)] if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
 
+def _is_matrix(value: Any) -> bool:
+    """Tell whether this is OpenCV's."""
+    return isinstance(value, dict) and {"rows", "data"} <= value.keys()
+
+
 def _pose(value: Any) -> tuple[list[float], str, str] | None:
-    """(numbers, what is known of the rotation, key that names it) of a node that can be a pose, or None."""
-    plain = isinstance(value, list) or (isinstance(value, dict) and "data" in value)
-    numbers = _flat(value) if plain else None
+    """(numbers, what is known of the rotation, "") of a node that can be a pose, or None."""
+    numbers = _flat(value) if isinstance(value, list) or _is_matrix(value) else None
     if numbers is not None:
         nested = isinstance(value, list) and any(isinstance(row, list) and len(row) > 1 for row in value)
         if len(numbers) not in _POSE_SIZES or (nested and len(numbers) < 12):
@@ -315,35 +369,35 @@ def _pose(value: Any) -> tuple[list[float], str, str] | None:
         return (numbers, "", "") if np.isfinite(numbers).all() else None
     if not isinstance(value, dict):
         return None
-    told = {re.sub(r"\(.*|_?(m|mm|deg|rad)$", "", str(key).lower()): each for key, each in value.items()}
+    told = {_plain_key(str(key)): each for key, each in value.items()}
     for rotation, columns in _COLUMNS.items():
         if {"x", "y", "z", *columns} <= told.keys():
             flat = _flat([told[name] for name in ("x", "y", "z", *columns)])
             return (flat, rotation, "") if flat is not None else None
-    parts: dict[str, list[float]] = {}
-    named = ""
-    for key, each in told.items():
-        flat = _flat(each)
-        for part, words, sizes in (("position", _POSITION, (3,)), ("rotation", _ROTATION, (3, 4, 9))):
-            if flat is not None and len(flat) in sizes and words is _half_named(key):
-                named = key if len(key.split("_")) > 1 and part not in parts else named
-                parts.setdefault(part, flat)
-    if len(parts) < 2:
-        return None
-    at, turn = parts["position"], parts["rotation"]
-    if len(turn) == 9:
-        return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])], "", named
-    ordered = any(isinstance(each, dict) and len(each) == 4 for each in told.values())
-    return at + turn, "xyzw" if ordered else "", named
-
-
-def _half_named(key: str) -> re.Pattern[str] | None:
-    """Which half of a pose a key names, by its last word that names one."""
-    for word in reversed(key.split("_")):
-        for words in (_POSITION, _ROTATION):
-            if words.fullmatch(word):
-                return words
     return None
+
+
+def _plain_key(key: str) -> str:
+    """A key without its unit."""
+    return re.sub(r"\(.*|_?(m|mm|deg|rad)$", "", key.lower())
+
+
+def _half(node: _Node) -> tuple[list[float], str, str] | None:
+    """(numbers, what is known of the rotation, which half) of a node that is half of a pose, or None.
+
+    The last word of its key that names one tells which.
+    """
+    words = _plain_key(node.keys[-1]).split("_") if node.keys else []
+    half = next((half for word in reversed(words) if (half := _half_of(word))), "")
+    flat = _flat(node.value) if half else None
+    if not flat or len(flat) not in _HALVES[half][1] or not np.isfinite(flat).all():
+        return None
+    ordered = isinstance(node.value, dict) and len(node.value) == 4
+    return flat, "xyzw" if ordered and not _is_matrix(node.value) else "", half
+
+
+def _half_of(word: str) -> str | None:
+    return next((half for half, (words, _) in _HALVES.items() if words.fullmatch(word.strip("#"))), None)
 
 
 def _facts(node: _Node, found: Lies) -> None:

@@ -209,7 +209,7 @@ def test_distances_of_camera_and_board_contradict_but_do_not_tell_the_mounting_a
 ) -> None:
     """A frame at the table or a camera near the base would deceive them."""
     folder = put(unnamed, change)
-    assert look(folder, Path("poses.txt")).tables and not look(folder, Path("others")).tables
+    assert look(folder, Path("poses.txt")).told and not look(folder, Path("others")).told
     with raises("which-mount"):
         believe(look(folder))
     found = believe(look(folder), Given(mount="eye-in-hand"))

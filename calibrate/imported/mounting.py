@@ -17,15 +17,13 @@ import numpy as np
 from calibrate.chain import learn_chain
 from calibrate.geometry import Array, inverse
 from calibrate.imported.readings import Reading
-from calibrate.imported.scenery import count_points
+from calibrate.imported.scenery import mount_by_scene
 from recordings.errors import ImportSourceError
 from recordings.importers.tables import Lies, Table
 from recordings.schema.messages import Mount
 
 _MOST_ROWS = 100
 """Most joints and poses from which axes are learned."""
-_FEWEST_POINTS, _TIMES = 30, 10
-"""Points around the board of the one kind that decide, and how many times as many as of the other."""
 _NEARER = 3.0
 """So many times as far from the base as from the flange, and beyond the reach over this, stands what the arm
 does not carry: a looser bound would leave rigs with long tools to guesses."""
@@ -72,7 +70,9 @@ def mounting(
         turned = inverted if straight != inverted else None
         facts = " ".join(f"{key} {str(value).lower()}" for key, value in lies.facts.items())
         named = _named(f"{name} {best.family}") or _named(f"{lies.words} {facts}")
-        names, scene, distances = by_turn[turned] | named, _by_scenery(best), by_turn[by_distances]
+        images = [(seen.images[view.index], view) for view in best.views] if seen.images else []
+        scene = mount_by_scene(images, seen.camera)
+        names, distances = by_turn[turned] | named, by_turn[by_distances]
         evidence = {"names": names, "the scene around the board": scene, far_apart: distances}
         # A bare wall, a gripper in the picture, or a frame at the table deceives one of the two alone.
         if given or names or (scene and distances):
@@ -86,16 +86,6 @@ def mounting(
     (mount,) = possible
     by = "as told" if given else f"by {', '.join(what for what, _ in why)}; {name}"
     return mount, mount != fits, turned_board, by
-
-
-def _by_scenery(best: Reading) -> set[Mount]:
-    if not best.seen.images:
-        return set()
-    images = [(best.seen.images[view.index], view) for view in best.views]
-    still, moved = count_points(images, best.views.camera)
-    if max(still, moved) < _FEWEST_POINTS or min(still, moved) * _TIMES > max(still, moved):
-        return set()
-    return {"eye-to-hand" if still > moved else "eye-in-hand"}
 
 
 def _inverted_by_distances(best: Reading) -> tuple[bool | None, str]:

@@ -1,82 +1,84 @@
-"""What is seen around the board: before a fixed camera it stays where it is, before a moving one it moves.
+"""What is seen around a board: in a fixed camera's pictures it stays, in a moving one's nothing does.
 
-Points of two images that look alike (SIFT: D. Lowe, "Distinctive image features from scale-invariant
-keypoints", 2004) are counted where they are clear of the board: those that stand still while the board moved,
-and those that moved along the epipolar line on which all moves that stands still with the board. The hand's
-own parts do the opposite of the scene, so that a few of the other kind mean nothing.
+Cells of the picture are compared with those at the same place of the next pictures, in which the board has
+moved. An arm, a gripper or an overlay does the opposite of the scene; each covers few tiles of the picture,
+so that the tiles speak, not the points.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 
 from calibrate.boards.corners import Grey
-from calibrate.geometry import Array, inverse, skew
-from calibrate.projection import camera_matrix, undistort
+from calibrate.geometry import Array
 from calibrate.views import BoardView
-from recordings.schema.messages import CameraModel
+from recordings.schema.messages import CameraModel, Mount
 
-_VIEWS, _POINTS = 16, 1500
-"""Most images, and most points of each, that are compared."""
+_VIEWS = 16
+"""Most pictures that are compared."""
+_WIDTH_PX, _CELL_PX, _TILES = 512, 16, 4
+"""Pictures are reduced to this width; cells in tiles, so many across and down."""
 _CLEAR = 1.5
-"""Points count outside the board's outline enlarged so much: it may be printed on a larger sheet."""
-_ALIKE = 0.75
-"""Largest distance to the point most like it, as a share of that to the second (Lowe's test)."""
-_STILL_PX, _MOVED_PX = 2.0, 10.0
-"""In images reduced to some 1000 px."""
+"""Cells count outside the board's outline enlarged so much: it may be printed on a larger sheet."""
+_MOVED_PX, _FINE_PX, _CONTRAST = 15.0, 4.0, 4.0
+"""Least motion of the board; larger shapes are light, not things; least deviation of grey in a cell."""
+_STAYS, _CHANGES = 0.9, 0.5
+"""Correlation above which a cell stays, and below which it changes."""
+_FEWEST, _KEEPS = 3, 0.2
+"""Fewest such cells by which a tile tells; it stays if this share does: by chance, one in a hundred does."""
+_SCENE, _OTHER, _ODDS = 0.75, 0.25, 1000.0
+"""Share of the tiles that do as the scene does, and that do so although it does the opposite; by these a
+mounting must be so much likelier."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Points:
-    seen_px: Array
-    """(n, 2)"""
-    rays: Array
-    """(n, 3) of the plain lens, z = 1."""
-    looks: Any
-    camera_from_board: Array
+def mount_by_scene(images: list[tuple[Grey, BoardView]], camera: CameraModel) -> set[Mount]:
+    """The mounting by which what is around the board is far likelier; empty: neither.
 
-
-def count_points(images: list[tuple[Grey, BoardView]], camera: CameraModel) -> tuple[int, int]:
-    """(points that stand still, points that move as the board does) of all pairs of near views.
-
-    The images may be smaller than the camera's, to which the views' pixels and the lens belong.
+    The pictures may be smaller than the camera's, to which the views' pixels belong.
     """
-    points = [_points(grey, view, camera) for grey, view in images[:_VIEWS]]
-    pairs = [(a, b) for step in (1, 2) for a, b in zip(points, points[step:], strict=False) if a and b]
-    focal_px = camera_matrix(camera)[0, 0] * images[0][0].shape[1] / camera.width
-    counts = [_compare(a, b, focal_px) for a, b in pairs]
-    return sum(still for still, _ in counts), sum(moved for _, moved in counts)
+    cells = [_cells(grey, view, camera) for grey, view in images[:_VIEWS]]
+    told = np.zeros((2, _TILES, _TILES))
+    for step in (1, 2):
+        for (grey, board, middle), (other, its_board, its_middle) in zip(cells, cells[step:], strict=False):
+            if np.linalg.norm(middle - its_middle) > _MOVED_PX:
+                told += _compare(grey, other, np.maximum(board, its_board))
+    stay, change = told
+    clear = stay + change >= _FEWEST
+    stays = stay > _KEEPS * (stay + change)
+    log_odds = np.where(stays, 1, -1)[clear].sum() * np.log(_SCENE / _OTHER)
+    return set() if abs(log_odds) < np.log(_ODDS) else {"eye-to-hand" if log_odds > 0 else "eye-in-hand"}
 
 
-def _points(grey: Grey, view: BoardView, camera: CameraModel) -> _Points | None:
-    scale = grey.shape[1] / camera.width
-    outline = cv2.convexHull((view.pixels * scale).astype(np.float32))[:, 0]
-    outline = outline.mean(axis=0) + _CLEAR * (outline - outline.mean(axis=0))
-    clear = cv2.fillConvexPoly(np.full_like(grey, 255), np.round(outline).astype(np.int32), 0)
-    found, looks = cv2.SIFT.create(_POINTS).detectAndCompute(grey, clear)
-    if len(found) < 2:
-        return None
-    seen = np.array([point.pt for point in found])
-    plain = np.column_stack([undistort(camera, seen / scale), np.ones(len(seen))])
-    rays = plain @ np.linalg.inv(camera_matrix(camera)).T
-    assert view.camera_from_board is not None
-    return _Points(seen, rays, looks, view.camera_from_board)
+def _cells(grey: Grey, view: BoardView, camera: CameraModel) -> tuple[Array, Array, Array]:
+    """(fine shapes of the reduced picture, 1 where the board is in it, the board's middle)"""
+    size = _WIDTH_PX, round(_WIDTH_PX * camera.height / camera.width)
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    seen = ((view.pixels + 0.5) * _WIDTH_PX / camera.width - 0.5).astype(np.float32)
+    outline = cv2.convexHull(seen)[:, 0]
+    outline = seen.mean(axis=0) + _CLEAR * (outline - seen.mean(axis=0))
+    board = cv2.fillConvexPoly(np.zeros(size[::-1]), np.round(outline).astype(np.int32), 1.0)
+    fine = cv2.GaussianBlur(small, (0, 0), 1) - cv2.GaussianBlur(small, (0, 0), _FINE_PX)
+    return np.asarray(fine, float), np.asarray(board), np.asarray(seen.mean(axis=0))
 
 
-def _compare(one: _Points, other: _Points, focal_px: float) -> tuple[int, int]:
-    """(points that stood still, points that moved as the board did) from one image to another."""
-    nearest = cv2.BFMatcher().knnMatch(one.looks, other.looks, 2)
-    alike = np.array([(a.queryIdx, a.trainIdx) for a, b in nearest if a.distance < _ALIKE * b.distance])
-    i, k = alike.reshape(-1, 2).astype(int).T
-    moved_px = np.linalg.norm(other.seen_px[k] - one.seen_px[i], axis=1)
-    motion = other.camera_from_board @ inverse(one.camera_from_board)
-    essential = skew(motion[:3, 3]) @ motion[:3, :3]
-    there, here = one.rays[i] @ essential.T, other.rays[k] @ essential
-    miss = np.abs((other.rays[k] * there).sum(axis=1))
-    away_px = focal_px * miss / np.minimum(*(np.linalg.norm(line[:, :2], axis=1) for line in (there, here)))
-    still = (moved_px < _STILL_PX) & (away_px > _STILL_PX)
-    return int(still.sum()), int(((moved_px > _MOVED_PX) & (away_px < _STILL_PX)).sum())
+def _compare(one: Array, other: Array, board: Array) -> Array:
+    """Cells that stay and that change, by tile, (2, tiles, tiles)."""
+    a, b, covered = (_in_cells(each) for each in (one, other, board))
+    a, b = a - a.mean(axis=-1, keepdims=True), b - b.mean(axis=-1, keepdims=True)
+    norms = np.sqrt((a**2).mean(axis=-1)), np.sqrt((b**2).mean(axis=-1))
+    alike = (a * b).mean(axis=-1) / np.maximum(norms[0] * norms[1], 1e-9)
+    told = (np.minimum(*norms) > _CONTRAST) & ~covered.any(axis=-1)
+    rows, columns = (np.arange(count) * _TILES // count for count in told.shape)
+    tiles = np.zeros((2, _TILES, _TILES))
+    for n, each in enumerate((told & (alike > _STAYS), told & (alike < _CHANGES))):
+        np.add.at(tiles[n], np.ix_(rows, columns), each)
+    return tiles
+
+
+def _in_cells(image: Array) -> Array:
+    """(rows, columns, cell's pixels)"""
+    height, width = (side // _CELL_PX for side in image.shape)
+    whole = image[: height * _CELL_PX, : width * _CELL_PX]
+    cells = whole.reshape(height, _CELL_PX, width, _CELL_PX).swapaxes(1, 2)
+    return np.asarray(cells.reshape(height, width, -1))

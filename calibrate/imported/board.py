@@ -162,14 +162,14 @@ def _likely(
 ) -> list[tuple[BoardSpec, bool]]:
     """Boards and whether their size is known: as they come where half of a few images show one at a glance,
     the others by the corners that are seen. One that an image suggested must first be found in that one."""
-    counted: list[tuple[int, int, BoardSpec, bool]] = []
+    counted: list[tuple[int, BoardSpec, bool]] = []
     for n, (each, shown) in enumerate(boards):
         known = each.square_m > 0
         board = each if known else msgspec.structs.replace(each, square_m=GUESSED_M)
         progress(n, n + 1, f"trying a {board.kind.value} {board.columns}×{board.rows}")
         part = any(
             shown is not None and not knew and board.columns <= larger.columns and board.rows <= larger.rows
-            for _, _, larger, knew in counted
+            for _, larger, knew in counted
         )  # of a board that one image shows whole
         try:
             if part or (shown is not None and not detect(shown, board, True, False, False).found):
@@ -179,10 +179,10 @@ def _likely(
             continue
         often = 2 * sum(found.found for found in seen) >= len(seen) and known
         corners = sum(found.corners for found in seen)
-        counted.append((-(10**6) if often else -corners, n, board, known))
+        counted.append((-(10**6) if often else -corners, board, known))
         if often:
             break
-    return [(board, known) for _, _, board, known in sorted(counted, key=lambda c: c[:2])]
+    return [(board, known) for _, board, known in sorted(counted, key=lambda c: c[0])]
 
 
 def _camera(lies: Lies, blank: CameraModel, views: tuple[BoardView, ...]) -> tuple[CameraModel, bool] | None:

@@ -71,12 +71,11 @@ def mounting(
         facts = " ".join(f"{key} {str(value).lower()}" for key, value in lies.facts.items())
         named = _named(f"{name} {best.family}") or _named(f"{lies.words} {facts}")
         images = [(seen.images[view.index], view) for view in best.views] if seen.images else []
-        scene = mount_by_scene(images, seen.camera)
-        names, distances = by_turn[turned] | named, by_turn[by_distances]
-        evidence = {"names": names, "the scene around the board": scene, far_apart: distances}
+        names, scene = by_turn[turned] | named, mount_by_scene(images, seen.camera)
+        evidence = {"names": names, "the scene around the board": scene, far_apart: by_turn[by_distances]}
         # A bare wall, a gripper in the picture, or a frame at the table deceives one of the two alone.
-        if given or names or (scene and distances):
-            possible = told | names | scene | distances
+        if given or names or (scene and by_turn[by_distances]):
+            possible = told.union(*evidence.values())
     why = [(what, says) for what, says in evidence.items() if says]
     if len(possible) != 1:
         said = "; ".join(f"{' or '.join(sorted(says))} by {what}" for what, says in why)

@@ -62,7 +62,7 @@ def readings(
     """Yield the best readings that the views can judge; `named`: the convention that the user gives, beside
     which the others are tried all the same."""
     asked = None if named is None else convention(named)
-    likely: list[tuple[float, int, Convention, str, Array, Seen, list[Key], Mount]] = []
+    likely: list[tuple[float, Convention, str, Array, Seen, list[Key], Mount]] = []
     for seen in seens:
         keys = [key for key in seen.views if key in pairs]
         if len(keys) < FEWEST:
@@ -73,14 +73,12 @@ def readings(
         ways = [way for way in spelt or ways if way[0] != asked]
         for how, evidence in ways if asked is None else [(asked, _AS_TOLD), *ways]:
             flange = how.poses(numbers)
-            likely += [
-                (_moves(seen, keys, flange, mount), len(likely), how, evidence, flange, seen, keys, mount)
-                for mount in _MOUNTS
-            ]
-    likely.sort(key=lambda each: each[:2])
-    as_told = [each for each in likely if each[3] == _AS_TOLD]
-    others = [each for each in likely if each[3] != _AS_TOLD]
-    for _, _, how, evidence, flange, seen, keys, mount in as_told[:_MOST] + others[:_MOST]:
+            moves = [(_moves(seen, keys, flange, mount), mount) for mount in _MOUNTS]
+            likely += [(moved, how, evidence, flange, seen, keys, mount) for moved, mount in moves]
+    likely.sort(key=lambda each: each[0])
+    as_told = [each for each in likely if each[2] == _AS_TOLD][:_MOST]
+    others = [each for each in likely if each[2] != _AS_TOLD][:_MOST]
+    for _, how, evidence, flange, seen, keys, mount in as_told + others:
         fitted = _fitted(seen, keys, flange, mount)
         if fitted is not None:
             yield Reading(table, how, family, pairs, seen, mount, *fitted, evidence)
@@ -183,16 +181,14 @@ def _beats(one: Reading, other: Reading) -> bool:
 
 def _nearest(readings: list[Reading]) -> dict[str, Any]:
     """The reading nearest to right, and what would make it right, as a solve names it."""
-    ranked = []
-    for n, reading in enumerate(readings):
-        found = explain_recording(_pose_views(reading.views, reading.seen))
-        gain = found.log_evidence_gain if found.reading in _CAUSES else 0.0
-        ranked.append((-reading.fit.log_evidence - gain, n, reading, found))
-    _, _, best, found = min(ranked, key=lambda each: each[:2])
+    explained = [explain_recording(_pose_views(reading.views, reading.seen)) for reading in readings]
+    gains = [found.log_evidence_gain if found.reading in _CAUSES else 0.0 for found in explained]
+    evidence = [reading.fit.log_evidence + gain for reading, gain in zip(readings, gains, strict=True)]
+    best, found = readings[at := int(np.argmax(evidence))], explained[at]
+    cause = found.reading.value if found.reading in _CAUSES else ""
+    text = f". {explain_text(found, best.views)}".rstrip(".") if cause else ""
     near = {"nearest": best.text, "stays_m": best.stays_m, "stays_rad": best.stays_rad}
-    if found.reading not in _CAUSES:
-        return {**near, "cause": "", "text": ""}
-    return {**near, "cause": found.reading.value, "text": ". " + explain_text(found, best.views).rstrip(".")}
+    return {**near, "cause": cause, "text": text}
 
 
 _CAUSES = (NamedReading.SHIFTED, NamedReading.MIRRORED, NamedReading.BOARD_MOVED, NamedReading.CAMERA_MOVED)

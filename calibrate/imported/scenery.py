@@ -17,16 +17,17 @@ from recordings.schema.messages import CameraModel, Mount
 
 _VIEWS = 16
 """Most pictures that are compared."""
-_WIDTH_PX, _CELL_PX, _TILES = 512, 16, 4
-"""Pictures are reduced to this width; cells in tiles, so many across and down."""
+_WIDTH_PX, _CELLS, _TILES = 512, (32, 24), (4, 4)
+"""Pictures are reduced to this width; cells, and tiles of cells, across and down."""
 _CLEAR = 1.5
 """Cells count outside the board's outline enlarged so much: it may be printed on a larger sheet."""
 _MOVED_PX, _FINE_PX, _CONTRAST = 15.0, 4.0, 4.0
 """Least motion of the board; larger shapes are light, not things; least deviation of grey in a cell."""
 _STAYS, _CHANGES = 0.9, 0.5
 """Correlation above which a cell stays, and below which it changes."""
-_FEWEST, _KEEPS = 3, 0.2
-"""Fewest such cells by which a tile tells; it stays if this share does: by chance, one in a hundred does."""
+_FEWEST, _KEEPS = 0.06, 0.2
+"""Fewest such cells, of a tile's, by which it tells; it stays if so many of them do: by chance, one in a
+hundred does."""
 _SCENE, _OTHER, _ODDS = 0.75, 0.25, 1000.0
 """Share of the tiles that do as the scene does, and that do so although it does the opposite; by these a
 mounting must be so much likelier."""
@@ -38,7 +39,7 @@ def mount_by_scene(images: list[tuple[Grey, BoardView]], camera: CameraModel) ->
     The pictures may be smaller than the camera's, to which the views' pixels belong.
     """
     cells = [_cells(grey, view, camera) for grey, view in images[:_VIEWS]]
-    told = np.zeros((2, _TILES, _TILES))
+    told = np.zeros((2, *_TILES))
     for step in (1, 2):
         for (grey, board, middle), (other, its_board, its_middle) in zip(cells, cells[step:], strict=False):
             if np.linalg.norm(middle - its_middle) > _MOVED_PX:
@@ -63,22 +64,12 @@ def _cells(grey: Grey, view: BoardView, camera: CameraModel) -> tuple[Array, Arr
 
 
 def _compare(one: Array, other: Array, board: Array) -> Array:
-    """Cells that stay and that change, by tile, (2, tiles, tiles)."""
-    a, b, covered = (_in_cells(each) for each in (one, other, board))
-    a, b = a - a.mean(axis=-1, keepdims=True), b - b.mean(axis=-1, keepdims=True)
-    norms = np.sqrt((a**2).mean(axis=-1)), np.sqrt((b**2).mean(axis=-1))
-    alike = (a * b).mean(axis=-1) / np.maximum(norms[0] * norms[1], 1e-9)
-    told = (np.minimum(*norms) > _CONTRAST) & ~covered.any(axis=-1)
-    rows, columns = (np.arange(count) * _TILES // count for count in told.shape)
-    tiles = np.zeros((2, _TILES, _TILES))
-    for n, each in enumerate((told & (alike > _STAYS), told & (alike < _CHANGES))):
-        np.add.at(tiles[n], np.ix_(rows, columns), each)
-    return tiles
+    """Shares of each tile's cells that stay and that change, (2, tiles, tiles)."""
+    both, a, b, covered = (_means(each, _CELLS) for each in (one * other, one**2, other**2, board))
+    told = (np.minimum(a, b) > _CONTRAST**2) & (covered == 0)
+    alike = both / np.sqrt(a * b + 1e-9)
+    return np.array([_means(told & each, _TILES) for each in (alike > _STAYS, alike < _CHANGES)])
 
 
-def _in_cells(image: Array) -> Array:
-    """(rows, columns, cell's pixels)"""
-    height, width = (side // _CELL_PX for side in image.shape)
-    whole = image[: height * _CELL_PX, : width * _CELL_PX]
-    cells = whole.reshape(height, _CELL_PX, width, _CELL_PX).swapaxes(1, 2)
-    return np.asarray(cells.reshape(height, width, -1))
+def _means(image: Array, size: tuple[int, int]) -> Array:
+    return np.asarray(cv2.resize(image.astype(float), size, interpolation=cv2.INTER_AREA))

@@ -123,11 +123,11 @@ def possible(numbers: Array) -> list[tuple[Convention, str]]:
         right = miss < 0.02 and bool((np.linalg.det(R) > 0).all())
         found = [(Convention("matrix"), f"rows at right angles within {miss:.1g}")] if right else []
         return _in_units(found, numbers[:, 3:12:4])
-    turn_first = _rotations(numbers[:, :-3]) if k == 7 or np.abs(numbers[:, -3:]).max() > _TURN else []
-    behind = [
-        (replace(how, rotation_first=True), evidence) for how, evidence in turn_first if not how.degrees
-    ]
-    return _in_units(_rotations(numbers[:, 3:]), numbers[:, :3]) + _in_units(behind, numbers[:, -3:])
+    ways = _in_units(_rotations(numbers[:, 3:]), numbers[:, :3])
+    if k == 7 or np.abs(numbers[:, -3:]).max() > _TURN:
+        behind = _in_units(_rotations(numbers[:, :-3]), numbers[:, -3:])
+        ways += [(replace(how, rotation_first=True), told) for how, told in behind if not how.degrees]
+    return ways
 
 
 def _rotations(turn: Array) -> list[tuple[Convention, str]]:

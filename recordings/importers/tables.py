@@ -9,10 +9,9 @@ from __future__ import annotations
 import json
 import os
 import re
-import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -30,7 +29,7 @@ from recordings.importers.messages import Array
 _FILES_LIMIT, _BYTES_LIMIT, _ARRAY_LIMIT_BYTES = 5000, 4 * 1024 * 1024, 128 * 1024
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 _YAML = (".yaml", ".yml", ".samples", ".calib")
-_SUFFIXES = (*_YAML, ".json", ".xml", ".csv", ".txt", ".dat", ".toml", ".tsv", ".script")
+_SUFFIXES = (*_YAML, ".json", ".xml", ".csv", ".txt", ".dat", ".tsv", ".script")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 _IMAGE = re.compile(rf"[^\s,;'\"\[\]]+(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))})\b", re.I)
 _POSE_SIZES = (6, 7, 12, 16, 8, 13, 17)
@@ -40,6 +39,8 @@ _HALVES = {
     "rotation": (re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues"), (3, 4, 9)),
 }
 """Words of the two halves of a pose that are told apart, and how many numbers each has."""
+_FORM = re.compile(r"m|mm|deg|rad|vec|vector|xyzw|wxyz|matrix|mat|\dx\d|x|angles?")
+"""Words of a half's name that tell its unit or form."""
 _COLUMNS = {
     "xyzw": ("qx", "qy", "qz", "qw"),
     "": ("rx", "ry", "rz"),
@@ -114,12 +115,12 @@ class _Row:
 
 def look(source: Path, poses: Path | None = None) -> Lies:
     """Read what lies in `source`; `poses` tells the robot's: a file, a folder or the end of their names."""
-    file = poses if poses is not None and poses.exists() else source / str(poses)
-    found, rows = Lies(source), defaultdict[tuple[str, ...], list[_Row]](list)
-    words = ["/".join(source.resolve().parts[-3:])]
+    file = poses if poses is None or poses.exists() else source / poses
+    found, words = Lies(source, told=None if poses is None else []), ["/".join(source.resolve().parts[-3:])]
+    rows = defaultdict[tuple[str, ...], list[_Row]](list)
     files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
     images = defaultdict[str, list[Path]](list)
-    for path in files if file.is_relative_to(source) else [*files, file]:
+    for path in files if file is None or file.is_relative_to(source) else [*files, file]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
             images[str(path.relative_to(source).parent / _pattern(path.name))].append(path)
             continue
@@ -142,7 +143,6 @@ def look(source: Path, poses: Path | None = None) -> Lies:
         for (named, *form), each in told.items():  # files of one row each make a table together
             rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
     found.images = dict(images)
-    found.told = None if poses is None else []
     found.words = " ".join(dict.fromkeys(words))
     for name, rotation, each in _joined(rows):
         for part, some in _two_by_two(each).items():
@@ -156,25 +156,24 @@ def look(source: Path, poses: Path | None = None) -> Lies:
 
 
 def _joined(rows: dict[tuple[str, ...], list[_Row]]) -> Iterator[tuple[str, str, list[_Row]]]:
-    """(name, rotation, rows) of whole poses, then of halves: those named alike but for which half they are,
-    of the rest those that lie in the same place."""
-    yield from ((key[0], key[1], each) for key, each in rows.items() if not key[2])
-    left = {key: each for key, each in rows.items() if key[2]}
-    for alike in (_without_half, lambda name: re.split("[ .]", name)[:-1]):
-        halves = defaultdict[tuple[str, int], dict[str, tuple[str, ...]]](dict)
-        for key, each in left.items():
-            halves[str(alike(key[0])), len(each)].setdefault(key[2], key)
-        for both in halves.values():
-            if len(both) == 2:
-                at, turn = both["position"], both["rotation"]
-                path, _, last = at[0].replace(" ", ".").rpartition(".")
-                pairs = zip(left.pop(at), left.pop(turn), strict=True)
-                poses = [replace(p, numbers=_put_together(p.numbers, r.numbers)) for p, r in pairs]
-                yield at[0] if "_" in last else at[0][: len(path)], turn[1], poses
-
-
-def _without_half(name: str) -> list[str]:
-    return [word for word in re.split(r"[/_. #]+", name.lower()) if _half_of(word) is None]
+    """(name, rotation, rows) of whole poses, then of halves named alike but for which half they are."""
+    halves = defaultdict[tuple[str, int], dict[str, tuple[str, ...]]](dict)
+    for key, each in rows.items():
+        if key[2]:
+            words = re.split(r"[/_. #]+", key[0].lower())
+            alike = " ".join(word for word in words if not (_half_of(word) or _FORM.fullmatch(word)))
+            halves[alike, len(each)].setdefault(key[2], key)
+        else:
+            yield key[0], key[1], each
+    for both in halves.values():
+        if len(both) == 2:
+            at, turn = both["position"], both["rotation"]
+            path, _, last = at[0].replace(" ", ".").rpartition(".")
+            for row, other in zip(rows[at], rows[turn], strict=True):
+                row.numbers += other.numbers
+                if len(row.numbers) == 12:  # a matrix has each row's number of the position behind it
+                    row.numbers = [row.numbers[k] for k in (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2)]
+            yield at[0] if "_" in last else at[0][: len(path)], turn[1], rows[at]
 
 
 def _without_count(table: Array) -> Array:
@@ -182,12 +181,6 @@ def _without_count(table: Array) -> Array:
     first, columns = table[:, 0], table.shape[1]
     rises = bool((np.diff(first) > 0).all()) and (columns != 7 or not np.any(first % 1))
     return table[:, 1:] if rises and columns in (7, 8, 13, 17) else table
-
-
-def _put_together(at: list[float], turn: list[float]) -> list[float]:
-    if len(turn) == 9:
-        return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])]
-    return at + turn
 
 
 def _two_by_two(rows: list[_Row]) -> dict[str, list[_Row]]:
@@ -221,12 +214,13 @@ def read_tree(path: Path) -> Any:
     suffix = path.suffix.lower()
     try:
         if suffix == ".mat":
-            held = loadmat(BytesIO(read_file(path, _BYTES_LIMIT)))
-            return {key: value.tolist() for key, value in held.items() if not key.startswith("__")}
+            told = loadmat(BytesIO(read_file(path, _BYTES_LIMIT)))
+            return {key: value.tolist() for key, value in told.items() if not key.startswith("__")}
         if suffix in (".npy", ".npz"):
             content = read_file(path, _ARRAY_LIMIT_BYTES)  # larger: an image of depths
             loaded = np.load(BytesIO(content), allow_pickle=False)
-            return loaded.tolist() if suffix == ".npy" else {key: loaded[key].tolist() for key in loaded}
+            held = {path.stem: loaded} if suffix == ".npy" else loaded
+            return {key: held[key].tolist() for key in held}
         if suffix not in _SUFFIXES:
             return None
         content = read_file(path, _BYTES_LIMIT)
@@ -235,8 +229,6 @@ def read_tree(path: Path) -> Any:
         if suffix in _YAML:
             plain = re.sub(rb"^%YAML.*\n|!!opencv-matrix|!!python/\S+", b"", content)
             return strict_yaml.load_plain(plain)
-        if suffix == ".toml":
-            return tomllib.loads(content.decode())
         if suffix == ".xml":
             return _of_xml(ElementTree.fromstring(content))
         return _of_text(content.decode("utf-8-sig", "replace"))
@@ -371,9 +363,9 @@ def _pose(value: Any) -> tuple[list[float], str, str] | None:
         return None
     told = {_plain_key(str(key)): each for key, each in value.items()}
     for rotation, columns in _COLUMNS.items():
-        if {"x", "y", "z", *columns} <= told.keys():
-            flat = _flat([told[name] for name in ("x", "y", "z", *columns)])
-            return (flat, rotation, "") if flat is not None else None
+        flat = _flat([told.get(name) for name in ("x", "y", "z", *columns)])
+        if flat is not None:
+            return flat, rotation, ""
     return None
 
 
@@ -392,8 +384,7 @@ def _half(node: _Node) -> tuple[list[float], str, str] | None:
     flat = _flat(node.value) if half else None
     if not flat or len(flat) not in _HALVES[half][1] or not np.isfinite(flat).all():
         return None
-    ordered = isinstance(node.value, dict) and len(node.value) == 4
-    return flat, "xyzw" if ordered and not _is_matrix(node.value) else "", half
+    return flat, "xyzw" if isinstance(node.value, dict) and "w" in node.value else "", half
 
 
 def _half_of(word: str) -> str | None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from benchmarks.misread_poses import MISREAD, said
@@ -23,6 +24,7 @@ from calibrate.kinematics import MODELS
 from calibrate.pipeline import solve_recording
 from calibrate.report.page import report_page
 from recordings.cli import main
+from recordings.importers.conventions import possible
 from recordings.importers.tables import look
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
@@ -187,6 +189,45 @@ def unnamed(folder: Path, T: np.ndarray) -> None:
 def of_a_frame_at_the_table(T: np.ndarray) -> np.ndarray:
     """As arms with a user frame tell them: board and camera are as near to both frames."""
     return np.linalg.inv(BOARD_PLACE) @ T
+
+
+def halves_in_files(folder: Path, T: np.ndarray) -> None:
+    """As OpenCV's hand-eye calls take them."""
+    np.save(folder / "R_gripper2base.npy", T[:, :3, :3])
+    np.save(folder / "t_gripper2base.npy", T[:, :3, 3])
+
+
+def halves_under_headings(folder: Path, T: np.ndarray) -> None:
+    R = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    text = (
+        f"{n}:\nRotation:\n{R[n].tolist()}\nTranslation:\n{T[n, :3, 3].tolist()}\n" for n in range(len(T))
+    )
+    (folder / "robot.txt").write_text("\n".join(text))
+
+
+def stamped(folder: Path, T: np.ndarray) -> None:
+    np.savetxt(folder / "tcp.txt", np.column_stack([1.6e9 + np.arange(len(T)) / 7, quaternions(T)]))
+
+
+def numbered_turn_first(folder: Path, T: np.ndarray) -> None:
+    turn = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    rows = np.column_stack([3 * np.arange(1, len(T) + 1), turn, 1e3 * T[:, :3, 3]])
+    np.savetxt(folder / "robot.csv", rows, delimiter=",")
+
+
+def matlabs(folder: Path, T: np.ndarray) -> None:
+    savemat(folder / "poses.mat", {"robotPoses": euler("XYZ", 1, True)(T)})
+
+
+@pytest.mark.parametrize(
+    "write", [halves_in_files, halves_under_headings, stamped, numbered_turn_first, matlabs]
+)
+def test_poses_are_found_in_whatever_holds_them(write: Write, tmp_path: Path) -> None:
+    """What their numbers allow is among what the images may decide."""
+    T = TURNED.flange_poses()[0]
+    write(tmp_path, T)
+    (table,) = (table for table in look(tmp_path).tables if table.whose in ("robot", ""))
+    assert any(np.allclose(how.poses(table.numbers), T, atol=1e-6) for how, _ in possible(table.numbers))
 
 
 def test_what_nothing_tells_is_asked(put: Callable[..., Path], images: tuple[Path, np.ndarray]) -> None:
@@ -388,6 +429,27 @@ def test_pairs_of_poses_are_a_recording_without_pictures(
     rec.unlink()
     assert call(main, "import", tmp_path, "-o", rec).returncode == 0  # as before
     assert open_recording(rec).views() == views
+
+
+def test_one_of_two_tables_is_named_the_robots_and_a_reading_told_whole_is_taken(tmp_path: Path) -> None:
+    """A poor arm is not refused for its noise: gates judge it. Told wrongly it is, by name."""
+    rng = np.random.default_rng(3)
+    robot, board = TURNED.flange_poses()[0].copy(), np.array(TURNED.camera_from_board())
+    np.savetxt(tmp_path / "b.txt", quaternions(board))
+    for noise_m in (0.0, 0.03):
+        robot[:, :3, 3] += noise_m * rng.standard_normal((len(robot), 3))
+        rotation_vectors(tmp_path, robot)
+        (tmp_path / "tcp_pose.txt").rename(tmp_path / "a.txt")
+        with raises("no-pairs"):
+            believe(look(tmp_path))
+        lies = look(tmp_path, Path("a.txt"))
+        if noise_m:
+            with raises("no-reading", nearest="a.txt: eye-in-hand, rotvec"):
+                believe(lies, Given(mount="eye-in-hand"))
+        found = believe(lies, Given("ur-rotvec", "eye-in-hand"))
+        np.testing.assert_allclose([row.base_from_flange for row in found.rows], robot, atol=1e-6)
+        with raises("no-reading" if noise_m else "other-convention"):
+            believe(lies, Given("euler-ZYX", "eye-in-hand"))
 
 
 @pytest.mark.skipif(not MOVEIT.is_file(), reason="the pose pairs of MoveIt's own test are not here")

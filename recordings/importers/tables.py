@@ -213,14 +213,11 @@ def read_tree(path: Path) -> Any:
     """A data file as dicts, lists, numbers and texts; None: no such file, or not readable as what it says."""
     suffix = path.suffix.lower()
     try:
-        if suffix == ".mat":
-            told = loadmat(BytesIO(read_file(path, _BYTES_LIMIT)))
-            return {key: value.tolist() for key, value in told.items() if not key.startswith("__")}
-        if suffix in (".npy", ".npz"):
-            content = read_file(path, _ARRAY_LIMIT_BYTES)  # larger: an image of depths
-            loaded = np.load(BytesIO(content), allow_pickle=False)
+        if suffix in (".npy", ".npz", ".mat"):
+            array = BytesIO(read_file(path, _ARRAY_LIMIT_BYTES))  # larger: an image of depths
+            loaded = loadmat(array) if suffix == ".mat" else np.load(array, allow_pickle=False)
             held = {path.stem: loaded} if suffix == ".npy" else loaded
-            return {key: held[key].tolist() for key in held}
+            return {key: held[key].tolist() for key in held if not key.startswith("__")}
         if suffix not in _SUFFIXES:
             return None
         content = read_file(path, _BYTES_LIMIT)

@@ -10,7 +10,7 @@ by that program's own rule, must find 500 known points where the calibration sho
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports import models, ros, vision
@@ -25,23 +25,22 @@ class Format(NamedTuple):
     says: str
     """For `calibrate export --help`."""
     make: Callable[[Calibration, FrameNames], str]
-    names_robot: bool = False
-    """Whether it writes names of the robot's frames, so that others may be given."""
-    attaches: bool = False
-    """Whether it can place a camera driver's own frame."""
+    frames: Literal["fixed", "named", "attached"] = "fixed"
+    """fixed: it names no frame of the robot. named: it does, and others may be given. attached: it can place
+    a camera driver's own frame, too."""
 
 
 FORMATS: dict[str, Format] = {
     "ros-camera-info": Format(".yaml", "ROS camera_info YAML: the intrinsics", ros.ros_camera_info),
     "ros-launch": Format(
-        ".launch.py", "ROS 2 launch file with the static transform", ros.ros_launch, True, True
+        ".launch.py", "ROS 2 launch file with the static transform", ros.ros_launch, "attached"
     ),
-    "urdf": Format(".urdf", "URDF: camera body and optical frame", models.urdf, True, True),
+    "urdf": Format(".urdf", "URDF: camera body and optical frame", models.urdf, "attached"),
     "opencv": Format(".yml", "OpenCV FileStorage: transform and intrinsics", vision.opencv),
     "halcon": Format(".dat", "HALCON pose: tool_in_cam_pose or base_in_cam_pose", vision.halcon),
     "zivid": Format(".yaml", "Zivid Matrix4x4: the transform, mm", vision.zivid),
     "ur-kinematics": Format(
-        ".yaml", "the corrected arm for ROS 2's ur_description", models.ur_kinematics, True
+        ".yaml", "the corrected arm for ROS 2's ur_description", models.ur_kinematics, "named"
     ),
 }
 
@@ -61,9 +60,9 @@ def export(
     if frames.validity is not None:
         anyway = "a calibration file that is named is exported all the same"
         require_usable(frames.validity, "The installed calibration", anyway)
-    if not form.names_robot and (frames.base, frames.flange) != (usual.base, usual.flange):
+    if form.frames == "fixed" and (frames.base, frames.flange) != (usual.base, usual.flange):
         raise ExportError("frames-of", format=name)
-    if frames.attach and not form.attaches:
+    if frames.attach and form.frames != "attached":
         raise ExportError("attach-of", format=name)
     if arm is not None:
         if name != "urdf":

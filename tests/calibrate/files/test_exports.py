@@ -154,9 +154,9 @@ def test_names_of_robot_frames_are_written_or_refused(calibration: Calibration, 
     try:
         text = export(calibration, name, FrameNames(base="its base", flange="its hand"))
     except ExportError as refused:
-        assert refused.code == "frames-of" and not FORMATS[name].names_robot
+        assert refused.code == "frames-of" and FORMATS[name].frames == "fixed"
     else:
-        assert FORMATS[name].names_robot and "its " in text
+        assert FORMATS[name].frames != "fixed" and "its " in text
 
 
 def test_frame_names_of_any_kind_stay_names(calibration: Calibration, tmp_path: Path) -> None:

@@ -26,8 +26,8 @@ were measured, on what computer, how many trials: `benchmarks/results/NAME.md`. 
 measures anew. Robot and camera are simulated unless said otherwise.
 """
 SHOWN: dict[str, str] = {
-    "real": r"^\| (ours /|the same|sets|split|good views|franka-|panda-)",
-    "coverage": r"^\| (clean|size 0.5 %|bent 0.5 mm|arm 0.4 mm, arm unknown) \| eye-to",
+    "real": r"^\| (ours /|the same|sets|split|good views|sukai|justmy|nirshal|kvasios|panda|\*\*median)",
+    "coverage": r"^\| (clean|size 0.5 %|bent 0.5 mm|arm 0.4 mm, arm unknown.*) \| eye-to",
     "outliers": r"^\| (far|shuffled) \| 40 % \| eye-in|moved \| 35 % \| eye-in",
     "any_arm": r"^\| seven joints",
     "mistakes": r"^\*\*",

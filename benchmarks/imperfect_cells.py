@@ -84,6 +84,8 @@ class ImperfectCell:
     """(n, 4, 4) true camera_from_board."""
     lens: CameraModel
     """The true one."""
+    told: Array
+    """(n, 4, 4) base_from_flange as the arm computes it, without noise."""
 
 
 def imperfect_cell(
@@ -112,7 +114,7 @@ def imperfect_cell(
     found = ViewSet(mount, seen, given, "UR10" if known.arm else "unknown")
     if not known.lens:
         found = replace(found, camera=calibrate_intrinsics(found, model).camera)
-    return ImperfectCell(solve_pnp(found, BOARD), X, Y, C, lens)
+    return ImperfectCell(solve_pnp(found, BOARD), X, Y, C, lens, told)
 
 
 def mounted(rng: np.random.Generator, mount: Mount) -> tuple[Array, Array]:

@@ -18,10 +18,10 @@ from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, read_calibration, write_output
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.exports.drivers import fixed_frames
-from calibrate.files.folders import cameras, current_validity, readable_folder
+from calibrate.files.folders import cameras, current_version, readable_folder, validity_of
 from calibrate.files.formatting import override_text, pose_text, summary, verdict_text
 from calibrate.files.proof import read_bounded
-from calibrate.files.validity import Validity, ValidityState, validity_text
+from calibrate.files.validity import LONGEST_AGE_DAYS, Validity, ValidityState, validity_text
 from calibrate.files.versions import InstalledVersion, installed_versions
 from recordings.files import MAIN_CAMERA, state_root
 
@@ -43,7 +43,8 @@ def named_or_installed(
     if file is not None:
         return read_calibration(file), None
     folder = readable_folder(root, camera)
-    return installing.installed_calibration(root, camera), current_validity(folder)
+    number, path = current_version(folder)
+    return read_calibration(path), validity_of(folder, number)
 
 
 def show(
@@ -119,7 +120,11 @@ def install(
     camera: Annotated[str, typer.Option(help="Name of the camera (default: as in the file)")] = "",
     max_age_days: Annotated[
         float | None,
-        typer.Option(min=0, help="In doubt when the last proof is older (default: as before; 0: never)"),
+        typer.Option(
+            min=0,
+            max=LONGEST_AGE_DAYS,
+            help="In doubt when the last proof is older (default: as before; 0: never)",
+        ),
     ] = None,
     override: Annotated[
         str, typer.Option(help="Reason to install in spite of a refusal; kept in the file")

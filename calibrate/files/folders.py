@@ -42,12 +42,17 @@ def cameras(root: Path | str | None = None) -> list[str]:
     return [*([MAIN_CAMERA] if (folder / "gen").is_dir() else []), *filter(is_session_name, others)]
 
 
+def current_name(folder: Path) -> str:
+    """Return the file name of the current version; empty where nothing is installed."""
+    try:
+        return (folder / "current").readlink().name
+    except OSError:
+        return ""
+
+
 def current_version(folder: Path) -> tuple[int, Path]:
     """Return number and file of the current version. InstallError when nothing is installed."""
-    try:
-        name = (folder / "current").readlink().name
-    except OSError:
-        name = ""
+    name = current_name(folder)
     match = VERSION_NAME.fullmatch(name)
     if match is None:
         raise InstallError("nothing-installed", folder=folder)

@@ -40,6 +40,7 @@ from calibrate.files.versions import (
     installed_versions,
     locked,
     make_current,
+    read_log,
     who,
 )
 from calibrate.geometry import difference
@@ -97,7 +98,7 @@ def install(
     camera = camera or calibration.camera_name
     folder = calibrations_folder(root, camera)
     with locked(folder):
-        before = _installed_before(root, camera)
+        before, damaged = _installed_before(root, camera)
         kinds = {cell} if before is None else {cell, _CELL_OF[before.source]}
         if other := kinds - {_CELL_OF[calibration.source]}:
             raise InstallError(
@@ -107,7 +108,7 @@ def install(
                 cell=other.pop(),
                 command=install_line(calibration.source, path),
             )
-        objections = _objections(calibration, before, robot_serial, camera_serial)
+        objections = [*damaged, *_objections(calibration, before, robot_serial, camera_serial)]
         if calibration.camera.name and calibration.camera.name != camera:
             objections.append(f"It is of the camera named {calibration.camera.name}, not {camera}.")
         objections += [f"Touch test, {touch_text(t)}." for t in calibration.verification if not agrees(t)]
@@ -171,9 +172,12 @@ def rollback(
     with locked(folder):
         known = installed_versions(root, camera)
         numbered = next((g for g in known if g.number == to), None)
-        target = before_current(known) if to is None else numbered
+        target = before_current(known, read_log(root, camera)) if to is None else numbered
         if target is None and to is None:
-            raise _nothing_older(root, camera, current_validity(folder))
+            withdrawn = current_validity(folder).state is ValidityState.WITHDRAWN
+            withdraw_it = f"To take it out of use: {_withdraw_line(root, camera)}"
+            advice = f"{WITHDRAWN_REMEDY}." if withdrawn else withdraw_it
+            raise InstallError("nothing-older", folder=folder, advice=advice)
         if target is None:
             have = ", ".join(str(g.number) for g in known) or "none"
             raise InstallError("no-such-version", folder=folder, generation=to, have=have)
@@ -185,16 +189,6 @@ def rollback(
         return make_current(folder, target, "rollback", validity, change, reason)
 
 
-def _nothing_older(root: Path | None, camera: str, validity: Validity) -> InstallError:
-    folder, command = calibrations_folder(root, camera), _withdraw_line(root, camera)
-    withdrawn = validity.state is ValidityState.WITHDRAWN
-    return InstallError(
-        "nothing-older",
-        folder=folder,
-        advice=f"{WITHDRAWN_REMEDY}." if withdrawn else f"To take it out of use: {command}",
-    )
-
-
 def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Validity:
     """Take the installed calibration out of use. Raises InstallError, also for an empty reason."""
     _require_words(reason)
@@ -204,7 +198,7 @@ def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Va
 
 def undo_line(root: Path | None = None, camera: str = MAIN_CAMERA) -> str:
     """Make the command that undoes the last installation: a rollback, or withdrawal where there is none."""
-    if before_current(installed_versions(root, camera)) is None:
+    if before_current(installed_versions(root, camera), read_log(root, camera)) is None:
         return _withdraw_line(root, camera)
     return shlex.join(["calibrate", "rollback", *_where(root, camera)])
 
@@ -298,9 +292,9 @@ def _require_words(reason: str) -> None:
 
 def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
     """List objections against replacing the installed one: other robot, camera, mounting, or larger error."""
-    before = _installed_before(root, calibration.camera_name)
+    before, damaged = _installed_before(root, calibration.camera_name)
     worse = [gate.text for gate in _regression(calibration, before)]
-    return [*_objections(calibration, before, "", ""), *worse]
+    return [*damaged, *_objections(calibration, before, "", ""), *worse]
 
 
 def change_text(before: Calibration | None, after: Calibration) -> str:
@@ -317,11 +311,16 @@ def change_text(before: Calibration | None, after: Calibration) -> str:
     return f"{millimetres:.3f} mm, {degrees:.4f}° ({sigmas:.1f}σ) from the one before"
 
 
-def _installed_before(root: Path | None, camera: str) -> Calibration | None:
-    """Read the current calibration, or the newest undamaged one, to compare a new one with; else None."""
+def _installed_before(root: Path | None, camera: str) -> tuple[Calibration | None, list[str]]:
+    """Read the current calibration, or the newest undamaged one, to compare a new one with; else None.
+
+    Also the objection that the current one is damaged.
+    """
     known = [g for g in installed_versions(root, camera) if g.calibration is not None]
     current = [g for g in known if g.current]
-    return (current or known)[-1].calibration if known else None
+    damaged = not current and (calibrations_folder(root, camera) / "current").is_symlink()
+    text = "The installed one is damaged: this one was not compared with it."
+    return (current or known)[-1].calibration if known else None, [text] if damaged else []
 
 
 def install_line(source: Source, path: Path, root: Path | None = None, override: str = "") -> str:

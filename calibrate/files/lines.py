@@ -31,11 +31,11 @@ def append_line(path: Path, entry: object) -> None:
 
 
 def share(path: Path) -> None:
-    """Give a new file the group permissions of its folder, because several operators share it."""
-    group_writes = path.parent.stat().st_mode & stat.S_IWGRP
-    if group_writes:
+    """Let the group do with a new file or folder what its owner may, where the group shares its place."""
+    if path.parent.stat().st_mode & stat.S_IWGRP:
+        mode = path.stat().st_mode
         with suppress(PermissionError):  # another operator made it
-            path.chmod(path.stat().st_mode | stat.S_IRGRP | group_writes)
+            path.chmod(mode | (mode & stat.S_IRWXU) >> 3)
 
 
 def read_lines(path: Path, kind: type[S]) -> list[S]:

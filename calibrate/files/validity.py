@@ -9,14 +9,16 @@ Needs only the standard library, because programs that use the camera load it to
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
-from typing import Literal
+from typing import Any, Literal
 
 from calibrate.errors import InstallError
 
 FILE = "validity.jsonl"
+LONGEST_AGE_DAYS = 36_500
+"""A longer limit of the last proof's age is a slip."""
 CheckKind = Literal["drift-check", "touch-test"]
 WITHDRAWN_REMEDY = (
     "Solve a new recording and run `calibrate install FILE`, "
@@ -63,13 +65,14 @@ class Validity:
 
     def at(self, now: datetime) -> Validity:
         """Return the validity at a time: in doubt once the last proof is older than `max_age_days`."""
-        proven = parse_time(self.verified)
-        if self.max_age_days is None or proven is None or self.state is ValidityState.WITHDRAWN:
-            return self
-        due = proven + timedelta(days=self.max_age_days)
-        if now <= due or self.state is ValidityState.IN_DOUBT:
+        proven = self._proven(now)
+        said_already = self.state in (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN)
+        if self.max_age_days is None or proven is None or said_already:
             return self
         age_days = (now - proven) / timedelta(days=1)
+        if not age_days > self.max_age_days:
+            return self
+        due = proven + timedelta(days=self.max_age_days)
         text = f"The last proof is {age_days:.1f} days old (limit {self.max_age_days:g}). Run a drift check."
         limits: dict[str, str | float | int | bool | None] = {
             "age_days": round(age_days, 3),
@@ -88,7 +91,7 @@ class Validity:
         is in doubt already. A pass then ends a doubt of the same kind of check; any other doubt becomes
         unverified. Views from before the last proof change nothing. No check restores a withdrawn version.
         """
-        proven = parse_time(self.verified)
+        proven = self._proven(datetime.now(UTC))
         if self.state is ValidityState.WITHDRAWN or (proven is not None and when < proven):
             return self
         doubted = self.state is ValidityState.IN_DOUBT
@@ -102,6 +105,11 @@ class Validity:
             since = self.since if self.state is ValidityState.VALID else time_text(when)
             return replace(changed, state=ValidityState.VALID, since=since, verified=time_text(when))
         return replace(changed, state=ValidityState.UNVERIFIED) if doubted else self
+
+    def _proven(self, now: datetime) -> datetime | None:
+        """Time of the last proof; None where it is unknown, as with a clock that was ahead."""
+        proven = parse_time(self.verified)
+        return None if proven is None or proven > now else proven
 
 
 _REFUSED = {
@@ -148,7 +156,7 @@ def validity_text(validity: Validity) -> str:
 def parse_validity(content: bytes) -> dict[int, Validity]:
     """Parse the last record of each version; `Validity.at` gives its state now.
 
-    Torn lines and lines of another shape are skipped.
+    Torn lines and lines of another shape are skipped; of a line, what a later version adds.
     """
     return {entry.version: entry for line in content.splitlines() if (entry := _parse(line)) is not None}
 
@@ -162,11 +170,19 @@ def unrecorded(version: int, installed: str = "") -> Validity:
 def _parse(line: bytes) -> Validity | None:
     try:
         plain = json.loads(line)
-        plain.pop("switch", None)
-        reason = ValidityReason(**plain.pop("reason"))
-        return Validity(**plain | {"state": ValidityState(plain["state"]), "reason": reason})
-    except (ValueError, TypeError, KeyError, AttributeError):
+        reason = ValidityReason(**_known(ValidityReason, plain["reason"]))
+        named = {"state": ValidityState(plain["state"]), "reason": reason}
+        found = Validity(**_known(Validity, plain) | named)
+        texts = found.since, found.who, found.verified, reason.code, reason.text
+        shaped = type(found.version) is int and isinstance(reason.values, dict)
+        shaped = shaped and all(isinstance(text, str) for text in texts)
+        return found if shaped and (found.max_age_days is None or found.max_age_days >= 0) else None
+    except (ValueError, TypeError, KeyError, RecursionError):
         return None
+
+
+def _known(kind: type[Validity | ValidityReason], plain: dict[str, Any]) -> dict[str, Any]:
+    return {known.name: plain[known.name] for known in fields(kind) if known.name in plain}
 
 
 def time_text(when: datetime | None = None) -> str:
@@ -178,11 +194,11 @@ def parse_time(text: str) -> datetime | None:
     """Parse a time; one without a zone is UTC. None where it is not a time."""
     try:
         found = datetime.fromisoformat(text)
-    except ValueError:
+        return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+    except (ValueError, OverflowError):
         return None
-    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
 
 
 def _shown(iso: str) -> str:
     when = parse_time(iso)
-    return "an unknown time" if when is None else f"{when.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+    return "an unknown time" if when is None else f"{when:%Y-%m-%d %H:%M} UTC"

@@ -32,18 +32,18 @@ from calibrate.files.calibration import (
     read_calibration,
     write_calibration,
 )
-from calibrate.files.folders import VERSION_NAME, calibrations_folder, read_validity, readable_folder
+from calibrate.files.folders import (
+    VERSION_NAME,
+    calibrations_folder,
+    current_name,
+    read_validity,
+    readable_folder,
+)
 from calibrate.files.lines import append_line, read_lines, share
 from calibrate.files.proof import read_bounded
 from calibrate.files.touch import LIMIT_SIGMAS, Touch, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
-from calibrate.files.validity import (
-    Validity,
-    ValidityReason,
-    ValidityState,
-    time_text,
-    unrecorded,
-)
+from calibrate.files.validity import Validity, ValidityReason, ValidityState, time_text, unrecorded
 from recordings.files import MAIN_CAMERA, open_regular, sync_folder, write_atomically
 
 Action = Literal["install", "rollback", "verify"]
@@ -71,6 +71,8 @@ class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     change: str = ""
     """Difference to the version before; for "verify", the result of the touch test."""
     reason: str = ""
+    replaced: int | None = None
+    """Version that was current before, 0 where there was none; None in older logs."""
 
 
 class _Line(msgspec.Struct):
@@ -85,7 +87,7 @@ def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> l
     InstallError where the folder is not readable.
     """
     folder = readable_folder(root, camera)
-    current, recorded, now = _current_name(folder), read_validity(folder), datetime.now(UTC)
+    current, recorded, now = current_name(folder), read_validity(folder), datetime.now(UTC)
     found = []
     for path in sorted((folder / "gen").glob("*.yaml")):
         match = VERSION_NAME.fullmatch(path.name)
@@ -110,29 +112,39 @@ def same_solve(one: Calibration, other: Calibration | None) -> bool:
     return msgspec.structs.replace(one, override=other.override, verification=other.verification) == other
 
 
-def before_current(known: list[InstalledVersion]) -> InstalledVersion | None:
+def before_current(known: list[InstalledVersion], log: list[LogEntry]) -> InstalledVersion | None:
     """Find the version that a rollback goes to, None when there is none.
 
-    It is the newest before the current one that is undamaged, not withdrawn, and of another solve: a touch
-    test makes a version too, and going back to the same numbers would undo nothing.
+    It is the last in use before the current one that nobody went back from, and is undamaged, not withdrawn,
+    and of another solve: a touch test makes a version too, and going back to the same numbers would undo
+    nothing.
     """
     current = next((version for version in known if version.current), None)
-    for older in reversed(known):
-        if current is None or older.number >= current.number or older.calibration is None:
-            continue
+    if current is None:
+        return None
+    used: list[int] = []
+    for number in (entry.generation for entry in log):
+        if number in used:
+            del used[used.index(number) :]
+        used.append(number)
+    by_number = {version.number: version for version in known}
+    for older in (by_number[number] for number in reversed(used) if number in by_number):
         withdrawn = older.validity is not None and older.validity.state is ValidityState.WITHDRAWN
-        if not withdrawn and not same_solve(older.calibration, current.calibration):
+        if older.calibration and not withdrawn and not same_solve(older.calibration, current.calibration):
             return older
     return None
 
 
 def read_log(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[LogEntry]:
-    """List every switch, oldest first."""
+    """List every switch, oldest first.
+
+    A line is written before its switch. Where a crash prevented that, another version is replaced next.
+    """
     folder = readable_folder(root, camera)
     entries = [line.switch for line in read_lines(folder / VALIDITY_FILE, _Line) if line.switch is not None]
-    if entries and not _current_name(folder).startswith(f"{entries[-1].generation:04d}-"):
-        entries.pop()  # it is written before the switch, which a crash prevented
-    return entries
+    current_after = [*(entry.replaced for entry in entries[1:]), _current_number(folder)]
+    pairs = zip(entries, current_after, strict=False)
+    return [entry for entry, number in pairs if number in (entry.generation, None)]
 
 
 def add_version(
@@ -146,10 +158,16 @@ def add_version(
     numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
     number = max(numbers, default=0) + 1
     path = folder / "gen" / f"{number:04d}-{hashlib.sha256(content).hexdigest()[:8]}.yaml"
-    write_atomically(path, content)
-    decode_calibration(read_bounded(path), str(path))
-    version = InstalledVersion(number, path, True, calibration)
-    return make_current(folder, version, action, validity, change, reason)
+    try:
+        write_atomically(path, content)
+        share(path)
+        decode_calibration(read_bounded(path), str(path))
+        version = InstalledVersion(number, path, True, calibration)
+        return make_current(folder, version, action, validity, change, reason)
+    except BaseException:
+        if current_name(folder) != path.name:
+            path.unlink(missing_ok=True)
+        raise
 
 
 def make_current(
@@ -157,18 +175,16 @@ def make_current(
 ) -> InstalledVersion:
     """Switch to a version and log it. Call inside `locked` only. InstallError where it reads back wrong."""
     validity = replace(validity, version=version.number)
-    entry = LogEntry(time_text(), action, version.number, who(), change, reason)
+    entry = LogEntry(time_text(), action, version.number, who(), change, reason, _current_number(folder))
     line = asdict(validity) | {"switch": entry}
     append_line(folder / VALIDITY_FILE, line)  # before the switch, so that it is never missing
     _switch(folder, version.path.name, read_bounded(version.path))
     return replace(version, current=True, validity=validity, change=change)
 
 
-def _current_name(folder: Path) -> str:
-    try:
-        return (folder / "current").readlink().name
-    except OSError:
-        return ""
+def _current_number(folder: Path) -> int:
+    match = VERSION_NAME.fullmatch(current_name(folder))
+    return int(match[1]) if match else 0
 
 
 def _switch(folder: Path, name: str, content: bytes) -> None:
@@ -196,10 +212,10 @@ def locked(folder: Path) -> Iterator[None]:
     before = ""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
-        before = _current_name(folder)
+        before = current_name(folder)
         yield
     except OSError as problem:
-        now, why = _current_name(folder), problem.strerror or str(problem)
+        now, why = current_name(folder), problem.strerror or str(problem)
         raise InstallError(
             "install-io", folder=folder, why=why, now=now or "nothing", switched=now != before
         ) from None

@@ -13,7 +13,7 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration
 from calibrate.files.install import Cell, install, rollback, withdraw
 from calibrate.files.validity import ValidityState
-from calibrate.files.versions import InstalledVersion, before_current, installed_versions
+from calibrate.files.versions import InstalledVersion, before_current, installed_versions, read_log
 from station.cell.session_folder import CALIBRATION_FILE, REPORT_FILE
 from station.operate.drift_check import check_arguments, recorded, start_drift_check
 from station.operate.motion import Approve
@@ -94,7 +94,7 @@ async def undo_install(desk: Desk, result: Result, calibration: Calibration) -> 
     root, camera = state_root(result.path), calibration.camera_name
     known = installed_versions(root, camera)
     current = next((g for g in known if g.current), None)
-    older = before_current(known)
+    older = before_current(known, read_log(root, camera))
     if current is None:
         desk.app.notify("Nothing is installed.")
         return

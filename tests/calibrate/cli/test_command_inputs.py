@@ -57,6 +57,7 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
     for option in ("--threads", "--time-limit-s", "--memory-limit-mib", "--seed", "--working-distance-mm"):
         refused(run("solve", session_file, option, "-3", cwd=tmp_path), 2, "", option)
         refused(run("solve", session_file, option, "1e300", cwd=tmp_path), 2, "", option)
+    refused(run("install", "c.yaml", "--max-age-days", "3000000", cwd=tmp_path), 2, "", "36500")
     refused(run("solve", cwd=tmp_path), 2)
     refused(run("export", "c.yaml", "--to", "nix", cwd=tmp_path), 2, "", "urdf")
 

@@ -154,19 +154,20 @@ def test_another_robot_camera_or_mount_is_refused(
     assert (root / "calibrations/current").read_bytes() == before
 
 
-def test_identity_is_still_checked_when_the_current_file_is_damaged(  # type: ignore[no-untyped-def]
-    make_file, solved_real: SolvedRecording, tmp_path: Path
+@pytest.mark.parametrize("versions", [1, 2])
+def test_a_damaged_current_file_is_an_objection_and_the_one_before_is_compared(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path, versions: int
 ) -> None:
     root = tmp_path / "s"
-    install(make_file(), root)
-    install(make_file(0.001), root)
+    for _ in range(versions):
+        install(make_file(), root)
     current = (root / "calibrations/current").resolve()
     current.chmod(0o600)
     current.write_bytes(b"garbage")
     robot = msgspec.structs.replace(solved_real.calibration.robot, serial="2099999999")
-    with raises("objection", InstallError):
+    with raises("objection", InstallError, objections=versions):
         install(make_file(robot=robot), root)
-    install(make_file(0.002), root)
+    install(make_file(0.002), root, override="its file is garbage")
     assert installed_calibration(root).result.translation_m[0] == pytest.approx(
         solved_real.calibration.result.translation_m[0] + 0.002
     )

@@ -17,11 +17,12 @@ from hypothesis import strategies as st
 
 from calibrate import load_installed, watch
 from calibrate.errors import CalibrationFileError, InstallError, UsageError
+from calibrate.files.calibration import read_calibration
 from calibrate.files.folders import cameras
 from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
 from calibrate.files.proof import canonical_json
 from calibrate.files.touch import Touch
-from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState
+from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState, validity_text
 from calibrate.files.versions import installed_versions, note_installed
 from tests.codes import raises
 
@@ -75,6 +76,38 @@ def test_old_views_tell_nothing_of_today(root: Path) -> None:
     long_ago = datetime(2020, 1, 1, tzinfo=UTC)
     note_check(root, "drift-check", MOVED, passed=False, proves=True, when=long_ago)
     assert load_installed(root).validity.state is V
+
+
+def test_a_failed_check_counts_though_the_clock_was_ahead_before(make_file: MakeFile, tmp_path: Path) -> None:
+    ahead = datetime.now(UTC) + timedelta(days=365)
+    path = make_file()
+    provenance = msgspec.structs.replace(
+        read_calibration(path).provenance, recorded_wall_ns=int(ahead.timestamp() * 1e9)
+    )
+    install(make_file(provenance=provenance), tmp_path / "s")
+    assert check(tmp_path / "s", passed=False).state is D
+
+
+@pytest.mark.parametrize(
+    ("line", "kept"),
+    [
+        ('"version":[1],"since":"","verified":""', False),
+        ('"version":true,"since":"","verified":""', False),
+        ('"version":1,"since":"","verified":null', False),
+        ('"version":1,"since":"","verified":"","max_age_days":"3"', False),
+        ('"version":1,"since":"","verified":"","max_age_days":NaN', False),
+        ('"version":1,"since":"0001-01-01T00:00+23:59","verified":"0001-01-01T00:00+23:59"', True),
+        ('"version":1,"since":"","verified":"","told_by":"a later version"', True),
+    ],
+)
+def test_a_line_of_another_shape_is_skipped_and_what_a_later_version_adds_to_one_is_ignored(
+    root: Path, line: str, kept: bool
+) -> None:
+    with (root / "calibrations/validity.jsonl").open("a") as file:
+        file.write('{"state":"withdrawn","reason":{"code":"withdrawn"},' + line + "}\n")
+        file.write("[" * 100_000 + "\n")
+    assert load_installed(root, require_valid=False).validity.state is (W if kept else V)
+    assert validity_text(installed_versions(root)[0].validity)  # type: ignore[arg-type]
 
 
 def test_what_a_person_withdrew_no_check_brings_back_and_no_rollback_finds(
@@ -148,6 +181,8 @@ def test_the_cells_own_rule_puts_an_old_proof_in_doubt(make_file: MakeFile, tmp_
     install(make_file(0.001), root)
     kept = load_installed(root, require_valid=False).validity
     assert (kept.state, kept.max_age_days) == (D, 30.0), "the rule is the cell's; the views are of 2023"
+    install(make_file(0.002), root, max_age_days=3e6)  # by a program: the command line refuses it
+    assert load_installed(root).validity.state is V
     install(make_file(0.002), root, max_age_days=0)
     assert load_installed(root).validity.max_age_days is None
 

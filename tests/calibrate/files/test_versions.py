@@ -84,8 +84,9 @@ def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
     monkeypatch.setattr("calibrate.files.versions.sync_folder", lambda path: full(path, b""))
     with raises("install-io", InstallError, switched=switched):
         install(make_file(1e-4), tmp_path / "root")
-    current = next(g.number for g in installed_versions(tmp_path / "root") if g.current)
-    assert current == 1 + switched
+    known = installed_versions(tmp_path / "root")
+    assert [g.number for g in known if g.current] == [1 + switched]
+    assert len(known) == 1 + switched, "what never was in use is no version"
 
 
 def test_files_of_others_beside_the_generations_are_left_alone(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
@@ -114,6 +115,29 @@ def test_rollback_passes_over_a_damaged_version(make_file, tmp_path: Path) -> No
     ]
 
 
+def test_rollback_goes_to_what_was_in_use(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not to a version that somebody went back from, nor to one whose switch a kill prevented."""
+    root = tmp_path / "s"
+    for k in range(2):
+        install(make_file(0.001 * k), root)
+    assert rollback(root).number == 1
+    install(make_file(0.002), root)
+    assert rollback(root).number == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_switch", lambda *_: os.link("here", "nowhere"))
+        patch.setattr(Path, "unlink", lambda *_, **__: None)
+        with pytest.raises(InstallError):
+            install(make_file(0.003), root)
+    assert len(installed_versions(root)) == 4
+    install(make_file(0.004), root)
+    assert [entry.generation for entry in read_log(root)] == [1, 2, 1, 3, 1, 5]
+    assert rollback(root).number == 1
+    rollback(root, to=3)
+    assert rollback(root).number == 1
+
+
 def test_a_change_is_told_in_millimetres_and_degrees(solved_real: SolvedRecording) -> None:
     before = solved_real.calibration
     after = shifted(before, 0.0, 0.0003, -0.0004, np.radians(0.03), 0.0, np.radians(0.04))
@@ -139,7 +163,8 @@ def test_what_was_configured_for_the_cell_is_held_against_the_file(  # type: ign
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can be two operators")
-def test_two_operators_of_a_group_share_a_folder(make_file) -> None:  # type: ignore[no-untyped-def]
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_two_operators_of_a_group_share_a_folder(make_file, umask: int) -> None:  # type: ignore[no-untyped-def]
     """A folder like /var/lib/station/calibrations: setgid, the group may write."""
     with tempfile.TemporaryDirectory() as place:  # pytest's own folders are for one user
         Path(place).chmod(0o755)
@@ -153,7 +178,7 @@ def test_two_operators_of_a_group_share_a_folder(make_file) -> None:  # type: ig
             file.chmod(0o644)
             child = os.fork()
             if child == 0:
-                os.umask(0o022)
+                os.umask(umask)
                 os.setgroups([65530])
                 os.setgid(operator)
                 os.setuid(operator)

@@ -52,10 +52,11 @@ def running_estimate(
         return blank
     try:
         views, X, Y = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
+        covariance = quick_covariance(views, config.board, X, Y, not lens_is_known)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return blank
     distance_m = median_distance_m(views.camera_from_board)
-    error_m = point_error_m(X, quick_covariance(views, config.board, X, Y, not lens_is_known), distance_m)
+    error_m = point_error_m(X, covariance, distance_m)
     return msgspec.structs.replace(
         blank,
         camera_pose=matrix4(X),
@@ -109,7 +110,7 @@ def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
 
 
 def quick_covariance(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> Array:
-    """Predict the covariance (6, 6) of X."""
+    """Predict the covariance (6, 6) of X. LinAlgError where X and Y put the board out of sight."""
     points = board_points(board)
     flange = views.base_from_flange
     each = view_information(views.mount, views.camera, flange, X, Y, points, USUAL_NOISE)

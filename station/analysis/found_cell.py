@@ -96,10 +96,10 @@ def find_cell(
         views, X, Y = solve_quickly(mount, camera, lens_known, board, seen)
         other: Mount = "eye-to-hand" if mount == "eye-in-hand" else "eye-in-hand"
         other_views, other_X, _ = solve_quickly(other, views.camera, True, board, seen)
+        variances = np.diag(quick_covariance(views, board, X, Y, not lens_known))
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None
     spread_m, other_m = _spread_m(views, X), _spread_m(other_views, other_X)
-    variances = np.diag(quick_covariance(views, board, X, Y, not lens_known))
     # Few views give a rough lens, so state at least the disagreement between the views.
     sigma_m = float(np.sqrt(variances[:3].sum() + spread_m**2))
     return FoundCell(

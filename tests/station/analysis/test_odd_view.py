@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, perturb, transform_points
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.projection import project_pixels
 from calibrate.views import board_in_camera
 from recordings.schema.messages import Mount
+from station.analysis.estimation import running_estimate
+from station.analysis.found_cell import find_cell
 from station.analysis.odd_view import FEWEST, odd_view
 from station.analysis.worker import CapturedView
 from station.simulation.cells import cell_config, make_cell
@@ -51,11 +53,14 @@ def test_what_cannot_be_is_named_and_what_can_is_not(mount: Mount) -> None:
         for index, flange in enumerate(flanges)
     ]
 
-    def told(count: int, change: Callable[[Array], Array], at: slice) -> str:
+    def changed(count: int, change: Callable[[Array], Array], at: slice) -> list[CapturedView]:
         views = seen[:count]
         for view in views[at]:
             views[view.index] = replace(view, base_from_flange=change(view.base_from_flange))
-        found = odd_view(mount, truth.board, blank, False, views)
+        return views
+
+    def told(count: int, change: Callable[[Array], Array], at: slice) -> str:
+        found = odd_view(mount, truth.board, blank, False, changed(count, change, at))
         return "" if found is None else found.code
 
     def typed_wrongly(T: Array) -> Array:
@@ -70,3 +75,12 @@ def test_what_cannot_be_is_named_and_what_can_is_not(mount: Mount) -> None:
         assert told(count, w_first, everything) == "poses-misread"
         assert told(count, inverse, everything) == "poses-misread"
     assert told(FEWEST - 1, w_first, everything) == ""
+
+    def other_tool(T: Array) -> Array:
+        return T @ pose(rotation_exp([0.0, 0.0, 2 * np.pi / 3]), np.zeros(3))
+
+    assert told(FEWEST, other_tool, slice(FEWEST - 1, None)) == "odd-view"
+    count, since = (7, 5) if mount == "eye-in-hand" else (6, 2)
+    torn = changed(count, other_tool, slice(since, None))  # the board would lie behind the camera
+    assert find_cell(mount, truth.board, blank, False, torn) is None
+    assert running_estimate(cell_config(truth), blank, False, torn).camera_pose is None

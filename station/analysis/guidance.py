@@ -1,9 +1,8 @@
 """Views by hand: which one would help most, the way there, and whether a view is new.
 
-Pure functions. While the camera pose is not known, a view helps by being different; once the views can be
-solved, by the information that it adds to X (`handeye.information`). Candidates are placements of the board
-before the camera near those seen so far: where a person was, he can go again, and no model of the arm is
-needed to know it.
+Pure functions. A view helps by the information that it adds to X (`handeye.information`); while X is not
+known, as if the flange were the camera. Candidates are placements of the board before the camera near those
+seen so far: where a person was, he can go again, and no model of the arm is needed to know it.
 """
 
 from __future__ import annotations
@@ -117,25 +116,24 @@ def next_view(
 
     `given_up`: wanted views (4, 4) to which the person did not get; what is near them is not asked for.
     """
-    points = board_points(board)
-    middle = points.mean(axis=0)
-    if (found := find_cell(mount, board, camera, lens_known, seen)) is None:
+    points, found = board_points(board), find_cell(mount, board, camera, lens_known, seen)
+    if found is None:  # as if the flange were the camera: how much is learned depends on its turns
         views = _placed(as_views(mount, _usual_lens(camera), board, seen), board)
-        at, pool = _boards(views), _candidates(views, board, given_up)
-        apart = [_least_difference(C, at, middle) for C in pool]
-        return NextView(mount, board, views.camera, at, pool[int(np.argmax(apart))])
-    views, X, Y = found.views, found.X, found.Y
-    lens, at = views.camera, views.camera_from_board
+        X = Y = np.eye(4)
+        flange = implied_flange(mount, X, Y, _boards(views))
+    else:
+        views, X, Y = found.views, found.X, found.Y
+        flange = views.base_from_flange
+    lens, at, pool = views.camera, _boards(views), _candidates(views, board, given_up)
     prior = prior_information(lens, lens_known, BoardTolerance.of(board))
     free = None if lens_known else slice(12, 12 + len(intrinsics_names(lens)))
-    distance_m = median_distance_m(at)
+    distance_m = median_distance_m(at if len(at) else pool)
     objective = Objective("A", distance_m, prior, free)
-    pool = _candidates(views, board, given_up)
-    flange = np.concatenate([views.base_from_flange, implied_flange(mount, X, Y, pool)])
+    flange = np.concatenate([flange, implied_flange(mount, X, Y, pool)])
     each = view_information(mount, lens, flange, X, Y, points, USUAL_NOISE)
     known, gains = each[: len(at)].sum(axis=0), each[len(at) :]
     best = int(np.argmin(objective(known + gains)))
-    after_m = predicted_error_m(known + gains[best], prior, X, distance_m)
+    after_m = None if found is None else predicted_error_m(known + gains[best], prior, X, distance_m)
     return NextView(mount, board, lens, at, pool[best], found, after_m)
 
 

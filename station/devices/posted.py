@@ -58,8 +58,6 @@ JUMP_M_S, JUMP_RAD_S = 2.5, 10.0
 """Ten times the speed to which arms are limited while a person is near (0.25 m/s); more is no motion."""
 ARRIVAL_S = 0.1
 """Posts without a time of their own may have been held up for so long on their way."""
-HELD_UP_S = 0.02
-"""A post that overtakes the others' delay by so much was not held up, and all before it were."""
 CLOCK_STEP_S = 1.0
 """Step of a program's clock against this computer's that is no delay."""
 
@@ -90,8 +88,6 @@ class PostedArm:
         self._states: deque[RobotState] = deque(maxlen=STATES_KEPT)
         self._clock: ClockEstimator | None = None
         """None: the posts have no time of their own."""
-        self._ahead_s = -math.inf
-        """Largest lead of the posts' clock over this computer's."""
         self._wrong: StaleStateError | None = None
         self._wrong_s = self._told_s = 0.0
         self._came = asyncio.Event()
@@ -228,7 +224,7 @@ class PostedArm:
         if declared.robot and declared.robot != model:
             reason = f"it posts the arm {declared.robot}, the cell's is {model}"
             raise RobotError("post-refused", poster=self._poster, reason=reason)
-        self._late_posted_s = declared.late_s
+        self._late_posted_s, self._clock = declared.late_s, None
         self._posts(others)
         async for some in lines:
             self._posts(some)
@@ -248,7 +244,7 @@ class PostedArm:
         before = self._states[-1] if self._states else None
         if (post.t is None) is not (self._clock is None):
             self._begin_anew()
-            before, self._clock = None, None if post.t is None else ClockEstimator()
+            before, self._clock = None, None if post.t is None else ClockEstimator(self._late_posted_s)
         told_s = arrived_ns / 1e9 if post.t is None else post.t
         wrong: StaleStateError | None = None
         if before is not None:
@@ -264,10 +260,6 @@ class PostedArm:
                 least_s = ARRIVAL_S if post.t is None else PAUSE_S
                 wrong = _jump(before.tcp_pose, pose, max(step_s, least_s))
         if self._clock is not None:
-            if (ahead_s := told_s - arrived_ns / 1e9) > self._ahead_s + HELD_UP_S:
-                # All before were held up on their way, and tell no time.
-                self._clock = ClockEstimator(latency_s=self._late_posted_s)
-            self._ahead_s = max(self._ahead_s, ahead_s)
             self._clock.add(told_s, arrived_ns)
         joints = post.joints_rad or ()
         stamps = Stamps(arrived_ns, time.time_ns(), told_s)
@@ -287,9 +279,8 @@ class PostedArm:
     def _begin_anew(self) -> None:
         """Forget what belongs to another clock."""
         self._states.clear()
-        self._ahead_s = -math.inf
         if self._clock is not None:
-            self._clock = ClockEstimator()
+            self._clock = ClockEstimator(self._late_posted_s)
 
     def _tell(self, notice: str) -> None:
         if notice != self.notice:

@@ -219,7 +219,7 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     if state in LATCHED:
         why = f"{sentence(status.reason)} Look at the cell first; F8 moves nothing.".strip()
         return Action("F8", "Acknowledge", why, look=True)
-    if state is StationState.DISCONNECTED:
+    if state is StationState.DISCONNECTED and not (status.robot.by_hand and status.session.recording):
         why = status.reason or "The robot does not answer."
         return Action("1", "See what is missing", why, look=True)
     if status.guidance.outline and state in (*RUNNING, StationState.FREE_DRIVE):
@@ -262,7 +262,7 @@ def to_wanted(guidance: GuidanceStatus, seen: DetectionStatus) -> Action:
 
 def _at_rest(known: Known, status: StationStatus) -> Action:
     session, result, missing = status.session, known.result, known.missing
-    if missing is not None:
+    if missing is not None and not session.recording:  # solving and installing need no device
         return Action("1", f"Mend: {missing.name}", missing.remedy or missing.text, look=True)
     if session.poses and not session.recording:
         asks = f"{status.reason} Shows the motion and asks first.".strip()

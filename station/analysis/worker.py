@@ -11,6 +11,7 @@ import base64
 import contextlib
 import multiprocessing
 import os
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -76,6 +77,7 @@ class BoardDetection:
 
 def start_worker() -> None:
     """Set up the worker process: low priority and one thread, to leave a processor for the capture."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches it too: the daemon ends it
     if (parent := multiprocessing.parent_process()) is not None and parent.pid is not None:
         die_with_parent(parent.pid)
     with contextlib.suppress(OSError):  # a service may not be permitted to

@@ -25,10 +25,9 @@ from station.cell.pose_plan import PlannedPose
 from station.cell.status import StationState, StationStatus
 from station.cli.daemon import own_daemon
 from station.protocol.client import Client
-from station.protocol.verbs import Acknowledge, Finish, Freedrive, Prepare, Record, Stop
+from station.protocol.verbs import Finish, Freedrive, Record
 from station.simulation.cells import cell_config, make_cell
 from station.simulation.truth import read_truth
-from tests.codes import raises
 from tests.command_line import call
 from tests.station.quick_plan import quick_plan
 from tests.system.conftest import status_when
@@ -112,10 +111,6 @@ async def test_views_by_hand_become_an_installed_calibration_that_knows_the_arm(
             hand.place = plan.poses[0]
             status = await status_when(client, lambda s: s.state is StationState.IDLE)
             assert status.robot.by_hand and status.simulated and status.robot.model == "arm of a friend"
-            with raises("moved-by-hand"):
-                await client.call(Prepare())
-            await client.call(Stop())
-            await client.call(Acknowledge())
             await client.call(Freedrive(on=True), timeout_s=60.0)
             for number, place in enumerate(plan.poses):
                 hand.place = place

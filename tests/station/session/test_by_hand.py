@@ -74,20 +74,6 @@ async def test_views_by_hand_carry_the_told_pose_and_joints(rig: Rig, told: tupl
     assert rig.arm.log == [] and rig.arm.beats == 0
 
 
-async def test_an_arm_without_speeds_that_creeps_is_not_captured(rig: Rig) -> None:
-    await rig.session.switch_free_drive(1, True)
-    await rig.session.record(1)
-    states = rig.session.context.stillness
-    for number in range(60):
-        rig.arm._controller_s += 0.008
-        state = rig.arm._state()
-        x, *others = state.tcp_pose
-        states.add(msgspec.structs.replace(state, tcp_pose=(x + 0.00001 * number, *others)))
-    assert not states.at_rest
-    with raises("not-settled"):
-        states.require_rest(rig.arm._state())
-
-
 async def test_a_pose_that_cannot_be_is_asked_about_with_its_view(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,8 +38,6 @@ class CellSetup:
         self.arm: ArmReader | None = None
         self.camera: CameraReader | None = None
         self.cameras: tuple[CameraChoice, ...] = ()
-        self.mount: Mount = self.draft.mount or "eye-in-hand"
-        """Mounting that is selected."""
         self.seen: BoardDetection | None = None
         """The board in the newest image; None: it was not looked for."""
         self.counts: tuple[int, int] | None = None
@@ -47,6 +45,11 @@ class CellSetup:
         self.guide: HandGuide | None = None
         self.guidance = GuidanceStatus()
         self._stillness = StillnessMonitor(StillnessConfig())
+
+    @property
+    def mount(self) -> Mount:
+        """The mounting as answered; until then the usual one."""
+        return self.draft.mount or "eye-in-hand"
 
     def keep(self, draft: Draft) -> None:
         """Set and save the draft. StationError when it cannot be saved; it is then kept in memory."""
@@ -140,14 +143,11 @@ class CellSetup:
         found = self.draft.found
         if found is None or not found.other_fits:
             return False
-        self.mount = "eye-to-hand" if self.mount == "eye-in-hand" else "eye-in-hand"
-        self.set_mount()
+        self.change_mount()
         return True
 
-    def set_mount(self) -> None:
-        """Save the selected mounting."""
-        if self.draft.mount != self.mount:
-            self.change(mount=self.mount)
+    def change_mount(self) -> None:
+        self.change(mount="eye-to-hand" if self.mount == "eye-in-hand" else "eye-in-hand")
 
     def set_board(self, board: BoardSpec) -> None:
         """Save the board; views stay when only its sizes are others."""

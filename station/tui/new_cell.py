@@ -218,7 +218,7 @@ class NewCell(LivePageApp[Ending]):
             self.step = STEPS[at]
 
     def action_other_mount(self) -> None:
-        self.setup.mount = "eye-to-hand" if self.setup.mount == "eye-in-hand" else "eye-in-hand"
+        self.setup.change_mount()
         self.watch_step()
 
     def on_input_changed(self) -> None:

@@ -196,7 +196,7 @@ async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
         case CellStep.CAMERA:
             return setup.camera is not None
         case CellStep.MOUNTING:
-            setup.set_mount()
+            setup.change(mount=setup.mount)
             return True
         case CellStep.BOARD:
             if text and (draft.board is None or text != flow.board_words(draft.board)):

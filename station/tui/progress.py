@@ -55,6 +55,8 @@ def progress_lines(known: Known, width: int, height: int) -> Content:
     """Draw how many poses are saved, the steps of the present one, and a chip for each."""
     status = known.shown
     session, pose = status.session, pose_under_way(status)
+    if not session.poses:
+        return dim("no plan yet")
     saved = sum(pose.counts for pose in session.poses)
     left = (
         ()

@@ -22,7 +22,7 @@ from station.tui.widgets.canvas import Canvas
 STYLES = ("$line", "$bad", "$accent", "$ok", "$strong", "bold $strong", "bold $warn")
 FLOOR, KEEP_OUT, PLANNED, SAVED, ARM, BOARD, CHOSEN = range(1, 8)
 """Ranks on the canvas: the higher is drawn over the lower."""
-LEGEND = "saved green, planned blue, chosen amber"
+LEGEND = "saved green, planned blue"
 _TURN_DEG, _LIFT_DEG = -60.0, 22.0
 """Direction of view about the base's z axis, and height of the eye above the floor."""
 _SHORT_M = 0.07

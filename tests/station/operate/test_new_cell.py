@@ -142,10 +142,8 @@ def test_views_that_fit_the_other_drawing_correct_the_mounting(
 ) -> None:
     setup = CellSetup(RealHardware(), tmp_path, tmp_path / "station.yaml")
     setup.keep(done[0])
-    setup.mount = done[0].mount or "eye-in-hand"
     assert not setup.correct_mount()
-    setup.mount = "eye-to-hand" if done[0].mount == "eye-in-hand" else "eye-in-hand"
-    setup.set_mount()
+    setup.change_mount()
     assert setup.correct_mount() and setup.draft.mount == done[0].mount
     assert setup.draft.found is not None and setup.draft.found.good
 

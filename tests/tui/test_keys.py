@@ -59,6 +59,7 @@ async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
         await pilot.press("f7")
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         assert link.verbs == []
+        await until(pilot, lambda: pilot.app.screen.query_one("#yes").region)
         await pilot.click("#yes")
         await until(pilot, lambda: link.verbs == ["finish"])
 

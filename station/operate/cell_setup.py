@@ -135,9 +135,6 @@ class CellSetup:
         guide.taken(True)
         return True
 
-    def drop_view(self) -> None:
-        self.change(views=self.draft.views[:-1])
-
     def correct_mount(self) -> bool:
         """Take the other mounting where the views fit it far better; tell whether they did."""
         found = self.draft.found

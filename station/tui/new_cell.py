@@ -253,7 +253,7 @@ class NewCell(LivePageApp[Ending]):
         self.open_live_page()
 
     def action_drop(self) -> None:
-        self.setup.drop_view()
+        self.setup.change(views=self.setup.draft.views[:-1])
         self._tell_found()
 
     def action_table_here(self) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+from scipy.cluster.hierarchy import fclusterdata
 
 from calibrate.boards.corners import (
     Grey,
@@ -129,16 +130,22 @@ _CELLS = 16
 """Samples from the middle of a circle to the edge of its patch."""
 _AS_LARGE = 1.4
 """Circles of one grid differ by less than this factor in size, unless seen from very near."""
+_TOGETHER = 2.5
+"""Neighbours of one grid are nearer than so many of its circles' widths."""
 _GUESSED_PX = 1.5
 """Farther than this from the middle of the ink a centre was guessed, not found."""
 
 
 def count_circles(grey: Grey) -> int:
-    """Count the dark blobs, or the light ones, that are about as large as most: circles of a grid there."""
+    """Count the dark blobs, or the light ones, of about one size that lie together: a grid's circles."""
     counts = [0]
     for image in (grey, cv2.bitwise_not(grey)):
-        size = np.array([blob.size for blob in _blobs(grey.size / 16).detect(image)])
-        counts.extend(((size > each / _AS_LARGE) & (size < each * _AS_LARGE)).sum() for each in size)
+        blobs = _blobs(grey.size / 16).detect(image)
+        at, size = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
+        for each in size:
+            alike = at[(size > each / _AS_LARGE) & (size < each * _AS_LARGE)]
+            if len(alike) > 1:
+                counts.append(np.bincount(fclusterdata(alike, _TOGETHER * each, "distance")).max())
     return int(max(counts))
 
 

@@ -258,12 +258,13 @@ def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
         sizes.setdefault(whole, sizes[max(sizes, key=lambda size: size[0] * size[1])])
     for size in sorted(sizes, key=lambda size: -size[0] * size[1])[: _TRIED + 2]:
         yield BoardSpec(BoardKind.CHESSBOARD, *size), sizes[size]
-    counted = {count_circles(grey): grey for grey in few}
-    for count, times in Counter(map(count_circles, few)).most_common(2):
+    counts = [count_circles(grey) for grey in few]
+    for count, times in Counter(counts).most_common(2):
+        alike = [grey for grey, circles in zip(few, counts, strict=True) if circles == count]
         for columns in range(3, count // 3 + 1) if times > 1 else ():
             if count % columns == 0:
                 for kind in (BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES):
-                    yield BoardSpec(kind, columns, count // columns), counted[count]
+                    yield from ((BoardSpec(kind, columns, count // columns), grey) for grey in alike)
 
 
 _DICTIONARIES = [

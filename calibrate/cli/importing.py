@@ -20,7 +20,7 @@ from recordings.cli.console import AsJson, plain_console, print_json, progress_b
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, import_bag
 from recordings.importers.bags import BAGS
-from recordings.importers.dataset import DATASET_FILE, read_dataset
+from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
 from recordings.importers.folder import Imported, import_folder, write_views
 from recordings.importers.messages import Progress
 from recordings.importers.selection import Wanted
@@ -95,7 +95,7 @@ def import_command(
         if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
         elif source.is_dir() and not any(path.suffix in BAGS for path in source.iterdir()):
-            told = dataset or _told(source, output)
+            told = read_dataset(dataset)[0] if dataset else _told(source, output)
             given = Given(convention, mount, None if board is None else typed_board(board))
             done = _import_found(look(source, poses), target, told, given, progress)
         else:
@@ -110,28 +110,26 @@ def import_command(
         _print_import(facts)
 
 
-def _told(source: Path, output: Path | None) -> Path | None:
+def _told(source: Path, output: Path | None) -> Dataset | None:
     """The description of a folder: in it, or as an earlier import of it wrote it beside its recording."""
-    if os.path.lexists(source / DATASET_FILE):
-        return source / DATASET_FILE
-    beside = None if output is None else output.with_suffix("." + DATASET_FILE)
-    if beside is None or not os.path.lexists(beside):
-        return None
-    poses = read_dataset(beside)[0].poses
-    return beside if poses is not None and poses.source == str(source.resolve()) else None
+    beside = source / DATASET_FILE if output is None else output.with_suffix("." + DATASET_FILE)
+    for path in filter(os.path.lexists, (source / DATASET_FILE, beside)):
+        told = read_dataset(path)[0]
+        if path.name == DATASET_FILE or (told.poses and told.poses.source == str(source.resolve())):
+            return told
+    return None
 
 
 @single_threaded_opencv()
 def _import_found(
-    lies: Lies, target: Path | None, told: Path | None, given: Given, progress: Progress
+    lies: Lies, target: Path | None, told: Dataset | None, given: Given, progress: Progress
 ) -> Imported:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
-    described = None if told is None else read_dataset(told)[0]
-    believed = believe(lies, given, described, progress)
+    believed = believe(lies, given, told, progress)
     dataset = believed.dataset
     content = msgspec.yaml.encode(dataset)
     done = write_views(lies.root, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
-    if target is not None and dataset != described:
+    if target is not None and dataset != told:
         write_atomically(target.with_suffix("." + DATASET_FILE), content)
     return replace(done, facts=believed.facts)
 

@@ -31,11 +31,6 @@ class Given:
     mount: Mount | None = None
     board: BoardSpec | None = None
 
-    @property
-    def tells_direction(self) -> bool:
-        """A maker's convention is the tool in the base; a spelt one tells the direction only if inverse."""
-        return self.convention in NAMED or (self.convention or "").endswith("-inverse")
-
 
 @dataclass(frozen=True, eq=False)
 class Believed:
@@ -146,7 +141,9 @@ def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
 def _believed(lies: Lies, given: Given, best: Reading) -> Believed:
     seen, pairs = best.seen, best.pairs
     joints, by_joints = joints_of(lies, best) or (None, None)
-    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, given.tells_direction, by_joints)
+    # A maker's convention is the tool in the base; a spelt one tells the direction only if inverse.
+    as_told = given.convention in NAMED or (given.convention or "").endswith("-inverse")
+    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, as_told, by_joints)
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)
     facts = {

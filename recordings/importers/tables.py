@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -48,12 +48,14 @@ _COLUMNS = {
     "ZYX": ("a", "b", "c"),
 }
 """Names of columns behind x, y, z, and the rotation that they name."""
-_ROBOT = re.compile(
-    r"robot|arm|tcp|tool|flange|gripper|hand(?!_?eye)|eef|end|effector|wrist|ee$|location", re.I
-)
-_BOARD = re.compile(r"cam|board|marker|target|track|obj|eye|chess|tag|sensor|[rt]vec", re.I)
-_OTHERS = re.compile(r"detect|joint|result|valid|guess|waiting|intrin", re.I)
-"""Words of tables that tell of the robot's pose, of the board's, and of something else."""
+_WHOSE = {
+    "other": re.compile(r"detect|joint|result|valid|guess|waiting|intrin", re.I),
+    "robot": re.compile(
+        r"robot|arm|tcp|tool|flange|gripper|hand(?!_?eye)|eef|end|effector|wrist|ee$|location", re.I
+    ),
+    "board": re.compile(r"cam|board|marker|target|track|obj|eye|chess|tag|sensor|[rt]vec", re.I),
+}
+"""Words of tables that tell of something else, of the robot's pose, and of the board's."""
 _PART = re.compile(r"(.*?)[_. ]?(q?[xyzw]|r[xyz]|roll|pitch|yaw|[abc]|\d+)")
 """A name of one number among those of a pose: whose pose, and which number."""
 
@@ -74,16 +76,13 @@ class Table:
     """Numbers in the row's file name and place, its order."""
 
     @property
-    def whose(self) -> Literal["robot", "board", "other", ""]:
-        """Read from its last words that say any; empty: none says."""
+    def whose(self) -> str:
+        """robot, board or other by its last words that say any; empty: none says."""
         name = re.sub(r"hand_?eye|(?i:(eye|hand)_?(in|to|on)_?(hand|eye))", "", self.name)
         for part in reversed(re.split(r"[ /.]", name)):
-            if _OTHERS.search(part):
-                return "other"
-            if _ROBOT.search(part):
-                return "robot"
-            if _BOARD.search(part):
-                return "board"
+            for whose, words in _WHOSE.items():
+                if words.search(part):
+                    return whose
         return ""
 
 
@@ -119,10 +118,10 @@ def look(source: Path, poses: Path | None = None) -> Lies:
     found, words = Lies(source, told=None if poses is None else []), ["/".join(source.resolve().parts[-3:])]
     rows = defaultdict[tuple[str, ...], list[_Row]](list)
     files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
-    images = defaultdict[str, list[Path]](list)
     for path in files if file is None or file.is_relative_to(source) else [*files, file]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
-            images[str(path.relative_to(source).parent / _pattern(path.name))].append(path)
+            alike = str(path.relative_to(source).parent / _pattern(path.name))
+            found.images.setdefault(alike, []).append(path)
             continue
         tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
         if tree is None:
@@ -142,7 +141,6 @@ def look(source: Path, poses: Path | None = None) -> Lies:
                 told[key].append(_Row(numbers, node.image, place, file in (path, *path.parents)))
         for (named, *form), each in told.items():  # files of one row each make a table together
             rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
-    found.images = dict(images)
     found.words = " ".join(dict.fromkeys(words))
     for name, rotation, each in _joined(rows):
         for part, some in _two_by_two(each).items():

@@ -103,8 +103,6 @@ class StopResult(msgspec.Struct, frozen=True):
     speed_m_s: float
     """Speed of the fastest modelled point, as approved."""
     figures: tuple[Figure, ...]
-    repeated: int = 0
-    """Number of moves before it whose stop could not be measured."""
     not_measured: str = ""
     """Why the stop could not be measured; empty: it was."""
 

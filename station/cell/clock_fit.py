@@ -11,7 +11,7 @@ last good reading goes into the bound, and arms stand still where the time count
 
 @dataclass(frozen=True)
 class ClockFit:
-    """Offset of a device's clock, as `devices.clocks` and `devices.frame_time` find it."""
+    """Offset of a device's clock, as `devices.clocks` and `devices.frames` find it."""
 
     reference_s: float
     """Device time for which `bound_s` holds."""

@@ -40,10 +40,8 @@ class Problem:
     pose: str
     limit: str
     text: str
-    joint: str = ""
-    """Joint or body that violates the limit."""
-    what: str = ""
-    """For clearance: which two things come too close."""
+    of: str = ""
+    """What violates it: a joint, or which two things come too close."""
 
     def __str__(self) -> str:
         return f"{self.pose}: {self.text}"
@@ -234,7 +232,7 @@ def _margin_problems(gaps: Array, contacts: Sequence[Contact], name: str) -> lis
                 "at the target" if at == len(gaps) - 1 else f"after {at / (len(gaps) - 1):.0%} of the path"
             )
             text = f"{contact}, {-1000 * gap[at]:.0f} mm too close {where}"
-            problems.append(Problem(name, "clearance", text, contact.body, str(contact)))
+            problems.append(Problem(name, "clearance", text, str(contact)))
     return problems
 
 

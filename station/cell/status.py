@@ -299,8 +299,6 @@ class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
     duration_s: float
     first_move: str
     """First move, as '84 mm and 22° to pose 1'"""
-    changes: tuple[str, ...] = ()
-    """Changes of the plan that come with the approval, and their gain."""
     warnings: tuple[str, ...] = ()
     start_joints_rad: Vector6 | None = None
     stop_test: StopTestMove | None = None

@@ -14,7 +14,7 @@ from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stam
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.clocks import monotonic_from_wall_ns
-from station.devices.frame_time import DeviceClock
+from station.devices.frames import DeviceClock
 from station.devices.genicam_settings import Applied, apply_settings, read_settings, require_settings
 
 if TYPE_CHECKING:

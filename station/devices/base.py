@@ -118,12 +118,10 @@ class Mover(Protocol):
     def control(self) -> bool:
         """True while the control program runs on the robot and takes moves from this station."""
 
-    @property
-    def control_path(self) -> str:
-        """Driver of the arm: ur_rtde or script; empty where no real arm moves."""
-
-    def control_trouble(self) -> tuple[str, str]:
-        """Say why this driver cannot be used, and the remedy; both empty: it can."""
+    control_path: str
+    """Driver of the arm: ur_rtde or script; empty where no real arm moves."""
+    control_trouble: tuple[str, str]
+    """Why this driver cannot be used, and the remedy; both empty: it can."""
 
     @property
     def remote(self) -> bool | None:

@@ -113,6 +113,7 @@ class PlaybackRobot:
         self.control = False
         self.identity, self.camera = self._recording.info.robot, self._recording.info.camera_identity
         self.control_path, self.notice, self.remote, self.kinematics = "", "", None, None
+        self.control_trouble = "", ""
         self.payload: tuple[float, ...] = ()
         self.guided = False
 
@@ -200,9 +201,6 @@ class PlaybackRobot:
         await asyncio.sleep(MOVE_S)
 
     def heartbeat(self) -> None: ...
-
-    def control_trouble(self) -> tuple[str, str]:
-        return "", ""
 
     def condition(self, state: RobotState) -> ArmCondition:
         """Describe it as running, as the recorded arm holds nobody up."""

@@ -12,7 +12,6 @@ import os
 import signal
 import time
 from collections.abc import Coroutine, Sequence
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -49,9 +48,7 @@ def control_path(config: RobotConfig) -> ControlPath:
     return config.control or ("ur_rtde" if library_installed() else "script")
 
 
-@cache
 def library_installed() -> bool:
-    """Tell whether ur_rtde is installed; looked up once, so that the driver stays the same while running."""
     return find_spec("rtde_control") is not None
 
 
@@ -70,6 +67,8 @@ class UrRobot(UrLink):
         super().__init__(config)
         self.notice = ""
         """Hint for people during a move that is no fault, such as a low speed slider; empty: none."""
+        self.control_path: str = control_path(config)
+        self.control_trouble = control_trouble(self.control_path)
         self._log_path = log_dir / "control.log"
         self._child: ControlChild | None = None
         self.control = False
@@ -85,13 +84,6 @@ class UrRobot(UrLink):
         self._tool_looked_s = 0.0
         """When TCP and payload were last checked during a move (host monotonic)."""
         self._background: set[asyncio.Task[object]] = set()
-
-    def control_trouble(self) -> tuple[str, str]:
-        return control_trouble(self.control_path)
-
-    @property
-    def control_path(self) -> ControlPath:
-        return control_path(self.config)
 
     @property
     def in_motion(self) -> bool:

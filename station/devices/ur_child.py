@@ -21,7 +21,6 @@ import msgspec
 
 from recordings.errors import ErrorData
 from recordings.files import open_regular
-from station.cell.config import ControlPath
 from station.cell.errors import RobotError, StaleStateError
 from station.devices.news import Delay
 from station.devices.ur_moves import STOP_RAD_S2
@@ -90,7 +89,7 @@ class ControlChild:
         self._loop.add_reader(channel, self._receive)
 
     @classmethod
-    def spawn(cls, host: str, log_path: Path, path: ControlPath = "ur_rtde") -> ControlChild:
+    def spawn(cls, host: str, log_path: Path, path: str = "ur_rtde") -> ControlChild:
         """Start the process (milliseconds). Call from the event loop's thread: the child dies with it.
 
         Raises RobotError when it cannot be started.

@@ -23,7 +23,7 @@ from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import DeviceThread
 from station.devices.discovery import kernel_text
-from station.devices.frame_time import by_arrival
+from station.devices.frames import by_arrival
 
 T = TypeVar("T")
 LATENCY_S = 0.2

@@ -29,11 +29,11 @@ async def start_drift_check(
         return True
     before = (await link.call(GetPlan())).plan if _never_run(status) else None
     lost = 0 if before is None else len(before.poses)
-    changes = () if before is None else (f"replaces the loaded plan of {lost} poses, which was never run",)
+    warnings = () if before is None else (f"the loaded plan of {lost} poses, never run, is replaced",)
     await link.call(MakePlan(poses, SEED, lens_known=True), timeout_s=PREPARE_S)
     started = False
     try:
-        started = await prepared_motion(link, Prepare(Purpose.DRIFT_CHECK), approve, changes=changes)
+        started = await prepared_motion(link, Prepare(Purpose.DRIFT_CHECK), approve, warnings=warnings)
     finally:
         if before is not None and not started:
             await link.call(LoadPlan(before))

@@ -57,12 +57,12 @@ async def prepared_motion(
     wanted: Prepare,
     approve: Approve,
     *,
-    changes: tuple[str, ...] = (),
+    warnings: tuple[str, ...] = (),
     plans_here: PlansHere | None = None,
 ) -> bool:
     """Check the whole path, ask a person to approve the motion, and start it. False: not approved.
 
-    `changes`: other effects of the approval. `plans_here`: asks whether to plan again if the plan was made
+    `warnings`: shown before the daemon's own. `plans_here`: asks whether to plan again if the plan was made
     from another posture.
     """
     try:
@@ -75,7 +75,7 @@ async def prepared_motion(
             raise
         await link.call(MakePlan(max(4, len(plan.poses)), plan.seed or 0), timeout_s=PREPARE_S)
         preview = await link.call(wanted, timeout_s=PREPARE_S)
-    preview = msgspec.structs.replace(preview, changes=(*changes, *preview.changes))
+    preview = msgspec.structs.replace(preview, warnings=(*warnings, *preview.warnings))
     if not await approve(preview):
         return False
     await link.call(Go(preview.token, preview.plan_sha256))
@@ -87,7 +87,6 @@ def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
     turn_deg = math.degrees(preview.largest_step_rad)
     return [
         ("What", f"{preview.purpose}, {preview.poses} pose{'s' * (preview.poses != 1)}"),
-        *(("Change", change) for change in preview.changes),
         ("First", preview.first_move),
         ("Distance", f"{preview.path_m:.2f} m of flange path, largest joint turn {turn_deg:.0f}°"),
         ("Speed", f"up to {preview.top_speed_m_s:.2f} m/s at any point of arm, tool and camera"),

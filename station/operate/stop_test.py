@@ -87,7 +87,7 @@ class AcceptanceTest:
     async def _tested(self, way: StopWay) -> bool:
         """Test one way, repeating moves that were not measured; False: failed, or not approved."""
         for tries in range(TRIES):
-            result = await self._move(way, tries)
+            result = await self._move(way)
             if result is None:
                 return False
             if not result.not_measured or tries == TRIES - 1:
@@ -97,7 +97,7 @@ class AcceptanceTest:
                 return result.passed
         return True
 
-    async def _move(self, way: StopWay, tries: int) -> StopResult | None:
+    async def _move(self, way: StopWay) -> StopResult | None:
         """Make one move and judge it; None: it was not approved."""
         test = StopTest(way, self.speed_m_s, self.joint, self._forward)
         self._forward = not self._forward
@@ -121,7 +121,7 @@ class AcceptanceTest:
         finally:
             states = await self.recorder.end()
         figures, not_measured = judge(states, move, moment_ns)
-        return StopResult(way, preview.top_speed_m_s, figures, tries, not_measured)
+        return StopResult(way, preview.top_speed_m_s, figures, not_measured)
 
     def _require_same_arm(self, preview: MotionPreview) -> None:
         """Note the arm of the first move; RefusedError when another one, or changed, is offered later."""

@@ -53,6 +53,12 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
         return (cls.__doc__ or "").split("\n")[0]
 
     @classmethod
+    def require(cls, state: S) -> None:
+        """Raise RefusedError where the verb is not allowed in a state."""
+        if (refusal := cls.refusal(state)) is not None:
+            raise refusal
+
+    @classmethod
     def refusal(cls, state: S) -> RefusedError | None:
         """Make the error where the verb is not allowed in a state; None where it is."""
         if state in cls.states:

@@ -65,8 +65,7 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
 
 
 def _control_check(context: SessionContext, mover: Mover) -> Check:
-    path = mover.control_path
-    trouble, remedy = mover.control_trouble()
+    path, (trouble, remedy) = mover.control_path, mover.control_trouble
     if trouble:
         return Check("control", "failed", trouble, remedy)
     if trouble := context.cell.acceptance_trouble(context.root):

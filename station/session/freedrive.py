@@ -89,8 +89,7 @@ class FreedriveCapture:
             raise RefusedError("session-open")
         await context.arm()
         await look_back(context)
-        if (refusal := Freedrive.refusal(store.state)) is not None:
-            raise refusal  # STOP came in between
+        Freedrive.require(store.state)  # STOP may have come in between
         context.requests.halt = False
         self.guide = HandGuide(context.cell.robot.latest, context.stillness, context.workers.call)
         # Enter the state at once: while the file is opened no motion is offered and no image begun.
@@ -102,10 +101,9 @@ class FreedriveCapture:
                 if store.state in (StationState.FREE_DRIVE, StationState.PAUSED):
                     store.enter(context.resting)
                 raise
-        if (refusal := Record.refusal(store.state)) is not None:
-            if store.state is StationState.IDLE:  # acknowledged before there was a recording to pause
-                store.enter(context.resting)
-            raise refusal  # STOP, or the end of freedrive, came in between
+        if store.state is StationState.IDLE:  # acknowledged before there was a recording to pause
+            store.enter(context.resting)
+        Record.require(store.state)  # STOP, or the end of freedrive, may have come in between
         store.enter(StationState.FREE_DRIVE, _GUIDE)
         context.show_poses()
 
@@ -169,8 +167,7 @@ class FreedriveCapture:
         context = self._context
         queue, store = context.loaded(), context.store
         joints = (await fresh(context.cell.robot)).joints_rad
-        if (refusal := Record.refusal(store.state)) is not None:
-            raise refusal  # STOP, or the end of freedrive, came in between
+        Record.require(store.state)  # STOP, or the end of freedrive, may have come in between
         index = queue.add(
             PlannedPose(f"hand-{len(queue.statuses) + 1:02d}", joints, why="guided by hand", guided=True)
         )

@@ -118,7 +118,6 @@ class Previewer:
 
 
 def _require_between_sessions(context: SessionContext) -> None:
-    if (refusal := Observe.refusal(context.store.state)) is not None:
-        raise refusal
+    Observe.require(context.store.state)
     if context.cell.source == "playback":
         raise RefusedError("played")

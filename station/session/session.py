@@ -366,8 +366,7 @@ class Session:
     def _require_state(self, verb: type[Verb[object]]) -> None:
         if verb.moves:
             self.context.cell.require_mover()
-        if (refusal := verb.refusal(self.store.state)) is not None:
-            raise refusal
+        verb.require(self.store.state)
 
     def _void(self) -> None:
         """Withdraw the motion that is offered for approval, if any."""

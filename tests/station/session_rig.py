@@ -160,6 +160,7 @@ class ArmInMemory:
     def heartbeat(self) -> None:
         self.beats += 1
 
+    @property
     def control_trouble(self) -> tuple[str, str]:
         return control_trouble(self.control_path)
 

@@ -16,7 +16,7 @@ from tests.tui.conftest import SUMMARY, FakeLink, app_on, commanded, idle, opene
 
 async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
     """Both easy answers are no; STOP works in the question, and no notice hides how to answer."""
-    link.answers["prepare"] = msgspec.structs.replace(SUMMARY, changes=("0.61 → 0.52 mm " * 6,))
+    link.answers["prepare"] = msgspec.structs.replace(SUMMARY, warnings=("0.61 → 0.52 mm " * 6,))
     async with opened(link, (60, 20), notifications=True) as pilot:
         pilot.app.notify("no session is open", timeout=3600)
         for stops, answer in enumerate(("escape", "enter", ""), start=1):
@@ -32,8 +32,8 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
                 await until(pilot, lambda: not isinstance(pilot.app.screen, ConfirmMotion))
         facts = text_of(pilot.app, "#confirm-body")
         assert "84 mm and 22° to pose 1" in facts and "0.22 m/s" in facts
-        change = next(i for i, line in enumerate(facts.splitlines()) if line.startswith("Change"))
-        assert facts.splitlines()[change + 1].startswith(" " * 10 + "0")  # a long fact goes on below itself
+        warning = next(i for i, line in enumerate(facts.splitlines()) if line.startswith("WARNING"))
+        assert facts.splitlines()[warning + 1].startswith(" " * 10 + "0")  # a long fact goes on below itself
         await pilot.click("#yes")
         await until(pilot, lambda: verbs.Go("t-1", SUMMARY.plan_sha256) in link.asked)
         await until(pilot, lambda: pilot.app.current_mode == "capture")  # where the work is watched

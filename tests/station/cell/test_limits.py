@@ -77,7 +77,7 @@ def test_an_obstacle_between_two_good_poses_is_found():
     problems = check_path(geometry, left, right, "pose 7").problems
     assert problems
     assert all(p.pose == "pose 7" and p.limit == "clearance" for p in problems)
-    assert "wrist 3 against the post" in {problem.what for problem in problems}
+    assert "wrist 3 against the post" in {problem.of for problem in problems}
 
 
 def test_a_plate_of_several_rods_is_one_problem():
@@ -90,7 +90,7 @@ def test_a_plate_of_several_rods_is_one_problem():
     worst_m = min(
         gap for gap, contact in zip(gaps[0], contacts, strict=True) if contact == ("board", "table", "plane")
     )
-    [told] = [p.text for p in check_path(cell, down, down).problems if p.what == "board against table"]
+    [told] = [p.text for p in check_path(cell, down, down).problems if p.of == "board against table"]
     assert told.startswith(f"board against table, {-1000 * (worst_m - SPACING_M / 2):.0f} mm too close")
 
 
@@ -116,12 +116,12 @@ def test_joint_range_and_step_name_the_joint():
     problems = check_path(
         CellGeometry(MODELS["UR10"], limits), REST, REST + np.array([0, 0, 0, 0, 0, 0.6])
     ).problems
-    assert {(p.limit, p.joint) for p in problems} == {("joint range", "wrist 3"), ("joint step", "wrist 3")}
+    assert {(p.limit, p.of) for p in problems} == {("joint range", "wrist 3"), ("joint step", "wrist 3")}
     limits = LimitsConfig(joints_min_rad=(-0.2, *(-6.28,) * 5))
     below = check_path(CellGeometry(MODELS["UR10"], limits), REST, REST - np.array([0.3, 0, 0, 0, 0, 0]))
-    assert [(p.limit, p.joint) for p in below.problems] == [("joint range", "base")]
+    assert [(p.limit, p.of) for p in below.problems] == [("joint range", "base")]
     beyond = check_path(FREE, REST, REST + np.array([6.4, 0, 0, 0, 0, 0])).problems
-    assert ("joint range", "base") in {(p.limit, p.joint) for p in beyond}
+    assert ("joint range", "base") in {(p.limit, p.of) for p in beyond}
 
 
 @pytest.mark.parametrize("bad", [[np.nan] * 6, [0.0] * 5, [np.inf, 0, 0, 0, 0, 0]])

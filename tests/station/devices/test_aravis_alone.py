@@ -14,7 +14,7 @@ from station.cell.errors import CameraError
 from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice
-from station.devices.frame_time import DeviceClock
+from station.devices.frames import DeviceClock
 from station.devices.genicam_settings import Applied, apply_settings, require_settings
 from tests.codes import raises
 

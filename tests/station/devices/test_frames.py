@@ -11,8 +11,15 @@ from recordings.schema.messages import ClockReading, FrameTime, Image, Stamps
 from station.cell.clock_fit import DRIFT
 from station.cell.errors import CameraError
 from station.cell.status import FrameTiming
-from station.devices.frame_time import DeviceClock, by_arrival, by_clock
-from station.devices.frames import FrameClock, FrameCounter, TriggerPulse, frames_between
+from station.devices.frames import (
+    DeviceClock,
+    FrameClock,
+    FrameCounter,
+    TriggerPulse,
+    by_arrival,
+    by_clock,
+    frames_between,
+)
 from tests.codes import raises
 
 MS = 1_000_000

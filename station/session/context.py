@@ -146,7 +146,6 @@ class SessionContext:
             name="",
             folder="",
             recording="",
-            calibration="",
             approved_again=0,
             check=check,
             elapsed_s=0.0,

@@ -8,7 +8,7 @@ import logging
 
 from recordings.errors import RecordingError
 from station.analysis.estimation import running_estimate, seen_before
-from station.analysis.odd_view import odd_view
+from station.analysis.found_cell import odd_view
 from station.analysis.pool import WorkerError
 from station.cell.status import EstimateStatus
 from station.session.context import SessionContext

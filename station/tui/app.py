@@ -20,18 +20,17 @@ from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
 from station.cell.errors import StationError
-from station.cell.status import MotionPreview, StationState
+from station.cell.status import MotionPreview, SessionStatus, StationState
 from station.operate.motion import PREPARE_S, prepared_motion
 from station.protocol import verbs
 from station.protocol.client import Client, who_am_i
 from station.protocol.states import RUNNING
 from station.protocol.verbs import PreviewImage, Purpose
-from station.tui.attendance import Attendance
 from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
-from station.tui.desk import SILENT_S, Desk, KnowingApp, StatusChanged
+from station.tui.desk import SILENT_S, Attendance, Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion
-from station.tui.installed import Marks, marks, read_result, read_sessions, state_root
+from station.tui.installed import Marks, marks, read_result, read_sessions, solved_file, state_root
 from station.tui.jobs import check_drift, solve_session
 from station.tui.live_page import SIDE_PX, LivePageApp, news_of
 from station.tui.log_screen import LogScreen
@@ -144,13 +143,12 @@ class StationApp(LivePageApp[None], KnowingApp):
             self.known = replace(self.known, gone=message.why, silent_s=None)
             return
         self.known = replace(self.known, status=status, gone="")
-        if before is None or before.session.calibration != status.session.calibration:
+        if before is None or before.session.recording != status.session.recording:
             self.action_look_at_disk()
-        elif status.guidance.outline and status.session.captured > before.session.captured:
-            if status.session.name == before.session.name:  # of another, they were taken before
-                self.bell()
-        elif before.session.name and not status.session.name:
+        if before is not None and before.session.name and not status.session.name:
             self.result_path = ""  # another session begins: what was looked at is no part of it
+        elif status.guidance.outline and before is not None and _one_more(before.session, status.session):
+            self.bell()
         if not self._greeted:
             self._greeted = True
             self.known = replace(self.known, configuration=self.desk.client.config)
@@ -180,10 +178,12 @@ class StationApp(LivePageApp[None], KnowingApp):
             asked = self._look.is_set()
             self._look.clear()
             if self.known.live is not None and (asked or not self.known.works):
-                await self._read_changed(self.known.live.session.calibration)
+                await self._read_changed(self.known.live.session)
 
-    async def _read_changed(self, solved: str) -> None:
-        path, client = self.result_path or solved, self.desk.client
+    async def _read_changed(self, session: SessionStatus) -> None:
+        client, path = self.desk.client, self.result_path
+        if not path and session.recording:
+            path = await asyncio.to_thread(solved_file, session.folder)
         root = state_root(path) if path else client.root
         if root is None or (found := (path, await asyncio.to_thread(marks, root))) == self._marks:
             return
@@ -289,6 +289,11 @@ class StationApp(LivePageApp[None], KnowingApp):
                     binding.tooltip,
                     partial(self.call_later, self.run_action, binding.action, place),
                 )
+
+
+def _one_more(before: SessionStatus, now: SessionStatus) -> bool:
+    """Tell whether a view was taken; those of another session were taken before."""
+    return now.name == before.name and now.captured > before.captured
 
 
 def run(socket: Path) -> None:

@@ -18,7 +18,7 @@ from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.versions import LogEntry, read_log, same_solve
 from recordings.files import MAIN_CAMERA
-from station.cell.session_folder import SessionSummary, list_sessions
+from station.cell.session_folder import CALIBRATION_FILE, SessionSummary, list_sessions
 
 Marks = frozenset[tuple[str, int]]
 
@@ -99,6 +99,12 @@ def local(iso: str) -> str:
 def state_root(calibration: str | Path) -> Path:
     """Return ROOT of ROOT/sessions/NAME/FILE; what is installed lies below the same ROOT."""
     return Path(calibration).resolve().parents[2]
+
+
+def solved_file(folder: str) -> str:
+    """Return the calibration file made from a session, by whatever program; empty: none yet."""
+    path = Path(folder) / CALIBRATION_FILE
+    return str(path) if path.is_file() else ""
 
 
 def marks(root: Path) -> Marks:

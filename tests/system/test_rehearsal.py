@@ -21,8 +21,8 @@ from calibrate.files.versions import installed_versions
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.cell.status import StationState
-from station.cli.attended import attended
 from station.cli.daemon import own_daemon
+from station.cli.session import attended
 from station.operate.motion import wait_until_idle
 from station.operate.new_cell import write_config
 from station.protocol.client import Client

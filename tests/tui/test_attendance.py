@@ -7,7 +7,7 @@ from textual import events
 
 from station.cell.status import StationState
 from station.protocol import verbs
-from station.tui import attendance
+from station.tui import desk
 from tests.tui.conftest import FakeLink, app_on, commanded, said, text_of, until
 
 LOST = verbs.Release(silent=True)
@@ -30,9 +30,9 @@ async def test_who_commands_a_moving_arm_is_asked_for(
     answered: bool,
     lost: bool,
 ) -> None:
-    monkeypatch.setattr(attendance, "ASK_S", 60.0)  # only the test asks
+    monkeypatch.setattr(desk, "ASK_S", 60.0)  # only the test asks
     asked = []
-    monkeypatch.setattr(attendance.Attendance, "ask", lambda seen: asked.append(seen))
+    monkeypatch.setattr(desk.Attendance, "ask", lambda seen: asked.append(seen))
     link.show(commanded(state, holder))
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
@@ -40,12 +40,12 @@ async def test_who_commands_a_moving_arm_is_asked_for(
         for _ in range(2 * answered):  # an answer begins the count again
             app.post_message(events.CursorPosition(0, 0))
             await until(pilot, lambda: app.attendance.unanswered == 0)
-            for _ in range(attendance.UNANSWERED):
+            for _ in range(desk.UNANSWERED):
                 await app.attendance.look()
             assert LOST not in link.asked
-        for _ in range(2 * attendance.UNANSWERED):
+        for _ in range(2 * desk.UNANSWERED):
             await app.attendance.look()
             await pilot.pause()
         assert (LOST in link.asked) is lost
         assert ("control released" in said(pilot)) is lost
-        assert len(asked) >= attendance.UNANSWERED or not lost
+        assert len(asked) >= desk.UNANSWERED or not lost

@@ -116,11 +116,13 @@ def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
 
 
 async def test_the_result_of_the_session_just_captured_needs_no_picking(link: FakeLink, root: Path) -> None:
-    app = app_on(link)
-    path = str(root / "sessions" / "s-1" / "calibration.yaml")
-    link.show(in_session(idle(), calibration=path))
+    app, folder = app_on(link), root / "sessions" / "s-1"
+    (folder / "calibration.yaml").rename(root / "later.yaml")
+    link.show(in_session(idle(), folder=str(folder), recording=str(folder / "session.mcap")))
     async with app.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: app.known.status is not None and app.known.status.session.calibration)
+        await until(pilot, lambda: app.known.sessions is not None)
+        assert app.known.result is None
+        (root / "later.yaml").rename(folder / "calibration.yaml")  # another program solved it
         await pilot.press("4")
         await until(pilot, lambda: "Session s-1" in text_of(app, "#verdict"))
 

@@ -15,8 +15,7 @@ from calibrate.projection import project_pixels
 from calibrate.views import board_in_camera
 from recordings.schema.messages import Mount
 from station.analysis.estimation import running_estimate
-from station.analysis.found_cell import find_cell
-from station.analysis.odd_view import FEWEST, odd_view
+from station.analysis.found_cell import FEWEST, find_cell, odd_view
 from station.analysis.worker import CapturedView
 from station.simulation.cells import cell_config, make_cell
 from tests.station.quick_plan import quick_plan

@@ -11,7 +11,7 @@ from rich.console import Console
 from station.cell.status import Event, PoseStatus, SessionStatus, StationStatus
 from station.cli import control as cli_control
 from station.cli import main
-from station.cli.attended import session_progress
+from station.cli.session import session_progress
 from station.protocol.verbs import Check
 from tests.command_line import call
 

@@ -16,7 +16,7 @@ from station.cell.errors import RobotError
 from station.cell.pose_plan import PlannedPose
 from station.cell.session_folder import SessionState
 from station.cell.status import StationState as S
-from station.cli.attended import STOP_ANSWER_S
+from station.cli.session import STOP_ANSWER_S
 from station.protocol.verbs import Purpose
 from station.session import session
 from station.session.recording import SessionRecording

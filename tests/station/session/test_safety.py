@@ -19,7 +19,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Skip
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
-from station.session import device_connector, monitor
+from station.session import device_connector, supervisor
 from station.session.recording import SessionRecording
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
@@ -178,8 +178,8 @@ async def test_the_supervisor_outlives_an_error_in_what_it_shows(
     def gone(path: object) -> None:
         raise OSError("the disk was pulled out")
 
-    monkeypatch.setattr(monitor, "DISK_PERIOD_S", 0.0)
-    monkeypatch.setattr(monitor.shutil, "disk_usage", gone)
+    monkeypatch.setattr(supervisor, "DISK_PERIOD_S", 0.0)
+    monkeypatch.setattr(supervisor.shutil, "disk_usage", gone)
     await until(lambda: rig.session.store.status.recorder.free_bytes is None)
     rig.session.supervisor.lags_s.clear()
     await until(lambda: rig.session.supervisor.lags_s)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import msgspec
 import pytest
 
 from station.cell.status import StationState as S
 from station.devices.rtde import RobotMode, SafetyMode
 from station.protocol.verbs import Purpose
-from station.session import monitor
+from station.session import supervisor
 from tests.patience import until
 from tests.station.session_rig import NewRig, Rig
 
@@ -19,14 +17,14 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
     await rig.go_until_it_moves()
     assert rig.session.store.status.pending == ""
     rig.session.pause("anna")
-    await until(lambda: rig.session.store.status.pending == monitor.PAUSES)
+    await until(lambda: rig.session.store.status.pending == supervisor.PAUSES)
     rig.arm.arrive.set()
     await rig.until(S.PAUSED)
     await until(lambda: rig.session.store.status.pending == "")
     await rig.give_go(Purpose.RESUME)
     await rig.until(S.MOVING)
     await rig.session.finish(1)
-    await until(lambda: rig.session.store.status.pending == monitor.FINISHES)
+    await until(lambda: rig.session.store.status.pending == supervisor.FINISHES)
 
 
 async def test_what_holds_an_arm_at_rest_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,26 +42,6 @@ async def test_what_holds_an_arm_at_rest_is_told(rig: Rig, monkeypatch: pytest.M
     await until(lambda: "has no power" in held())
     monkeypatch.setattr(rig.arm, "latest", good)
     await until(lambda: held() == "")
-
-
-async def test_a_session_is_told_as_solved_while_its_calibration_is_there(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(monitor, "DISK_PERIOD_S", 0.0)
-    await rig.give_go()
-    await until(lambda: bool(rig.session.store.status.session.recording))
-    session = rig.session.store.status.session
-    assert session.calibration == ""
-    path = Path(session.folder) / "calibration.yaml"
-    path.write_text("a process of its own writes it")
-    await until(lambda: rig.session.store.status.session.calibration == str(path))
-    path.unlink()
-    await until(lambda: rig.session.store.status.session.calibration == "")
-    path.write_text("")
-    await until(lambda: rig.session.store.status.session.calibration == str(path))
-    rig.arm.slow = True
-    await rig.give_go()
-    assert rig.session.store.status.session.calibration == ""
 
 
 async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) -> None:

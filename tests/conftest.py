@@ -38,7 +38,9 @@ for _size in ("COLUMNS", "LINES"):  # a shell may export them: what is printed w
     os.environ.pop(_size, None)
 
 # How long an example takes is no property: a computer may have much else to do.
-settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "patient", deadline=None, max_examples=50, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("patient")
 
 MAY_BE_SENT = {

@@ -14,7 +14,7 @@ from station.cell.limits import check_plan, point_speed_m_s
 from station.cell.pose_plan import Plan, PlannedPose
 from station.simulation.controller.kinematics import TABLES, ArmGeometry
 
-PLANS, MOVES = 80, 2
+PLANS, MOVES = 40, 2
 STEP_S = 0.02
 
 

@@ -20,7 +20,7 @@ import typer
 from recordings.errors import CodedError, ErrorReport
 from station.cell.pose_plan import plan_sha256
 from station.cell.status import MotionPreview
-from station.cli import attended, main
+from station.cli import main, session
 from station.cli.app import STATION
 from station.cli.daemon import tell_what_goes_on
 from station.cli.demo import simulated_daemon
@@ -109,7 +109,7 @@ async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFi
         async def call(self, verb: object, *, timeout_s: float) -> None:
             raise NoAnswerError(f"no answer from the daemon within {timeout_s:.0f} s.")
 
-    await attended.stop_and_say(Hanging())  # type: ignore[arg-type]
+    await session.stop_and_say(Hanging())  # type: ignore[arg-type]
     said = capsys.readouterr().err
     assert "emergency stop" in said
 
@@ -126,7 +126,7 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(typer, "confirm", pressed)
 
     async def ask() -> bool:  # below an event loop's own handler of Ctrl-C
-        return attended.ask_person(summary)
+        return session.ask_person(summary)
 
     before = signal.getsignal(signal.SIGINT)
     assert asyncio.run(ask()) is False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -39,14 +38,3 @@ def test_events_of_a_session() -> None:
         show(StationStatus(events=(earlier, later)))
     assert "sealed" not in words.getvalue(), "it was told before the session"
     assert f"event {ALL}" in words.getvalue()
-
-
-def test_no_command_makes_a_console_of_its_own() -> None:
-    """`plain_console` reads no markup and obeys no foreign text; the screen is Textual's."""
-    room = Path(main.__code__.co_filename).parent
-    files = {
-        file
-        for file in room.rglob("*.py")
-        if "Console(" in file.read_text() or "plain_console(" in file.read_text()
-    }
-    assert files == {room / "console.py"}

@@ -13,9 +13,7 @@ from station.devices.rtde import (
     PacketReader,
     PacketType,
     Recipe,
-    join_names,
     packet,
-    split_names,
 )
 from tests.codes import raises
 
@@ -93,8 +91,3 @@ def test_a_packet_of_the_wrong_length_is_refused() -> None:
 def test_a_refused_variable_is_named() -> None:
     with raises("rtde-variables"):
         Recipe(1, ("timestamp", "nonsense"), ("DOUBLE", "NOT_FOUND"))
-
-
-def test_a_trailing_comma_is_no_name() -> None:
-    assert split_names(b"timestamp,actual_q,") == ("timestamp", "actual_q")
-    assert join_names(["timestamp", "actual_q"]) == b"timestamp,actual_q"

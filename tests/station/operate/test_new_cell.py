@@ -77,7 +77,7 @@ def test_what_was_written_is_read_back_and_can_be_planned(done: tuple[Draft, obj
     config, content = load_config(path)
     assert config == made
     assert content.count(b"#") >= 6
-    group, _ = candidate_pool(layout_of(config), PlanOptions(), None, np.random.default_rng(0))
+    group, _ = candidate_pool(layout_of(config), PlanOptions(pool=200), None, np.random.default_rng(0))
     assert len(group) >= 75
     flow.write_config(draft, path)
     assert (tmp_path / "deep" / "station.yaml.before").read_bytes() == content

@@ -8,22 +8,8 @@ import pytest
 from calibrate.geometry import perturb
 from calibrate.kinematics import MODELS
 from calibrate.kinematics import forward as station_forward
-from station.simulation.controller.arm import History
 
 Q = (0.3, -1.2, 1.6, -1.0, -1.3, 0.4)
-
-
-def test_history_interpolates_and_knows_its_bounds() -> None:
-    history = History(0.008)
-    with pytest.raises(LookupError):
-        history.at(0)
-    for i in range(10):
-        history.add(1000 + i * 8, (float(i),) * 6, (0.0,) * 6)
-    assert history.at(1004)[0][0] == pytest.approx(0.5)
-    assert history.at(1000)[0][0] == 0.0 and history.at(1072)[0][0] == 9.0
-    for outside in (999, 1073):
-        with pytest.raises(LookupError):
-            history.at(outside)
 
 
 def differ(of: str, *columns: tuple[float, ...]) -> dict[str, tuple[float, ...]]:

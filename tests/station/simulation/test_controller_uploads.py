@@ -34,7 +34,3 @@ def test_programs_are_found_in_any_segmentation(cuts: list[int]) -> None:
         stream = stream[cut:]
     assert [u.name for u in seen] == ["rtde_control", "", "note"]
     assert seen[0].text == SCRIPT and seen[1].text == "stopj(2.0)"
-
-
-def test_bytes_that_are_no_text_do_no_harm() -> None:
-    assert [u.name for u in UploadReader().feed(b"\xff\xfe\n")] == [""]

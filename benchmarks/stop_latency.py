@@ -18,12 +18,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from station.cli.attended import Attended, attended
 
 from benchmarks.trials import table, trials
 from station.cell.errors import StationError
 from station.cell.status import StationState
 from station.cli.daemon import own_daemon
+from station.cli.session import Attended, attended
 from station.protocol.verbs import Acknowledge, MakePlan, Purpose
 from station.simulation.launch import AdminClient
 from tests.tui.terminal import ScreenProcess

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from recordings.errors import CodedError
@@ -19,6 +20,13 @@ class UsageError(CalibrationError):
 
     code = "output"
     exit_code = 2
+
+
+def require_positive(**numbers: float | None) -> None:
+    """Raise UsageError (`not-positive`) where one is given and is not finite and above 0."""
+    for name, given in numbers.items():
+        if given is not None and not 0 < given < math.inf:
+            raise UsageError("not-positive", name=name, given=given)
 
 
 def require_choice(name: str, given: object, choices: Iterable[str]) -> None:

@@ -17,7 +17,7 @@ from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
 from calibrate.gates import judge
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
-from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.priors import BoardTolerance, LensPrior
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.job import JobOptions, PreparedViews, SolvedRecording
@@ -126,11 +126,17 @@ def solve_recording(
     )
 
 
+_FIXED = 1e-9
+"""1σ of a number that the lens' calibration held fixed."""
+
+
 def _lens_sigma(options: JobOptions, camera: CameraModel) -> tuple[float, ...] | None:
-    names = intrinsics_names(camera)
-    if options.camera is None or not all(options.camera_sigma.get(name, 0.0) > 0 for name in names):
+    """Take the stated 1σ; zero: held fixed, not stated: the usual one. None where none is stated."""
+    stated = options.camera_sigma
+    if options.camera is None or not any(sigma > 0 for sigma in stated.values()):
         return None
-    return tuple(options.camera_sigma[name] for name in names)
+    usual = zip(intrinsics_names(camera), LensPrior.given(camera).sigma, strict=True)
+    return tuple(max(stated.get(name, float(sigma)), _FIXED) for name, sigma in usual)
 
 
 def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:

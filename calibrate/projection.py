@@ -62,9 +62,9 @@ def project_pixels(camera: CameraModel, points: Array) -> Array:
 
 
 def _rays(points: Array) -> tuple[Array, Array, Array]:
-    """x/z, y/z and 1/z."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        w = 1.0 / points[..., 2]
+    """x/z, y/z and 1/z; NaN at and behind the camera, which would see a mirrored twin there."""
+    z = points[..., 2]
+    w = 1.0 / np.where(z > 0, z, np.nan)
     return points[..., 0] * w, points[..., 1] * w, w
 
 

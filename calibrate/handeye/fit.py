@@ -69,6 +69,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used))
+    require_motion(pairs)  # a wrong view may have been the only one about a second axis
     arm = None if log_bayes is None else arm
     return CellFit(
         views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, unknown, failure,

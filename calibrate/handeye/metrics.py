@@ -76,26 +76,30 @@ def board_spread(H: Array, camera_from_board: Array, X: Array) -> tuple[float, f
     return float(np.sqrt(distance2.mean())), float(np.sqrt((angle**2).mean()))
 
 
-def axis_spread(pairs: Pairs) -> tuple[Array, Array]:
-    """Compute singular values (3,) of the rotation vectors α of A (rms, rad) and directions (3, 3) by row."""
-    _, singular, directions = np.linalg.svd(pairs.alpha, full_matrices=False)
-    return np.asarray(singular / np.sqrt(len(pairs))), np.asarray(directions)
+def axis_spread(rotations: Array) -> tuple[Array, Array]:
+    """Compute singular values (3,) of rotation vectors (n, 3) (rms, rad) and directions (3, 3) by row."""
+    _, singular, directions = np.linalg.svd(rotations, full_matrices=False)
+    return np.asarray(singular / np.sqrt(len(rotations))), np.asarray(directions)
 
 
 def require_motion(pairs: Pairs) -> None:
-    """Raise DegenerateMotionError, naming what is missing, unless the arm turns about two axes."""
-    singular, directions = axis_spread(pairs)
-    if singular[0] < _MIN_SECOND_AXIS_RAD:
-        raise DegenerateMotionError("rotation-range", largest_rad=float(screw_invariants(pairs.A)[0].max()))
-    if singular[1] < _MIN_SECOND_AXIS_RAD:
-        raise DegenerateMotionError(
-            "one-axis",
-            axis=", ".join(f"{v:+.2f}" for v in directions[0]),
-            second_axis_rad=float(singular[1]),
-            limit_rad=float(_MIN_SECOND_AXIS_RAD),
-        )
+    """Raise DegenerateMotionError, naming what is missing, unless arm and camera turn about two axes."""
+    for rotations in (pairs.alpha, pairs.beta):
+        singular, directions = axis_spread(rotations)
+        if singular[0] < _MIN_SECOND_AXIS_RAD:
+            largest_rad = float(screw_invariants(pairs.A)[0].max())
+            raise DegenerateMotionError("rotation-range", largest_rad=largest_rad)
+        if singular[1] < _MIN_SECOND_AXIS_RAD:
+            raise DegenerateMotionError(
+                "one-axis",
+                axis=", ".join(f"{v:+.2f}" for v in directions[0]),
+                second_axis_rad=float(singular[1]),
+                limit_rad=float(_MIN_SECOND_AXIS_RAD),
+            )
 
 
+_ON_A_LINE = 1e-6
+"""Width of a view's corners across their line, as a share of their length, that fixes no pose."""
 FEWEST_TO_SOLVE = 4
 """Fewest views of a solve."""
 FEWEST_CORNERS_IN_VIEW = 4
@@ -140,6 +144,9 @@ def _require_view(view: BoardView, fewest_corners: int) -> None:
     finite = np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()
     right = bool(fewest_corners <= corners == points and finite)
     require(right, "corners", corners=corners, points=points, minimum=fewest_corners)
+    if corners:
+        spread = np.linalg.svd(view.board_points - np.mean(view.board_points, axis=0), compute_uv=False)
+        require(bool(spread[1] > _ON_A_LINE * spread[0]), "corners-in-line")
 
 
 def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> Observability:
@@ -160,7 +167,7 @@ def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> 
     text = f"{kind} ({', '.join(f'{v:+.2f}' for v in direction)}) in {parent}: 1σ {sigma * 1e3:.3f} mm" + (
         f" at {distance_m:.2f} m" if kind == "turn about" else ""
     )
-    singular, _ = axis_spread(pairs)
+    singular, _ = axis_spread(pairs.alpha)
     return Observability(
         weakest_direction=worst,
         weakest_text=text,

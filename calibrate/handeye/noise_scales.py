@@ -53,6 +53,10 @@ class Scales:
         return np.concatenate([GAIN[:, None] ** 2 * np.repeat(self.robot, 3) ** 2, garbage[None]])
 
 
+LEAST_ROBOT = 1e-7
+"""Least robot noise (m and rad): below it, poses are a computation, and their rounding is no arm's error."""
+
+
 def update_robot(scales: Scales, chances: Array, z: Array, P: Array) -> Scales:
     """Update the robot's two scales and the shares of the classes.
 
@@ -64,7 +68,7 @@ def update_robot(scales: Scales, chances: Array, z: Array, P: Array) -> Scales:
     up = found.reshape(2, 3).sum(axis=1) + 1 / square
     down = predicted.reshape(2, 3).sum(axis=1) + 2 / (square + _USUAL_ROBOT**2)
     total = chances.sum(axis=0) + SHARE_COUNTS
-    robot = np.sqrt(square * up / down)
+    robot = np.sqrt(square * up / down).clip(LEAST_ROBOT)
     return replace(scales, robot=robot, shares=total / total.sum())
 
 

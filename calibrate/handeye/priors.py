@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from calibrate.errors import require_positive
 from calibrate.geometry import Array, difference
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic
 from calibrate.projection import intrinsics_names, intrinsics_vector
@@ -32,6 +33,9 @@ class BoardTolerance:
     square: float = 0.003
     """Relative, of the size of the squares, and of their size in x against that in y."""
     flatness_m: float = 0.001
+
+    def __post_init__(self) -> None:
+        require_positive(square=self.square, flatness_m=self.flatness_m)
 
     @property
     def sigma(self) -> Array:
@@ -65,7 +69,7 @@ class LensPrior:
             sigma = np.array([_KNOWN.get(name, 0.0) for name in names])
             sigma[:2] = _KNOWN_SHARE * mean[:2]
             sigma[2:4] = _KNOWN_SHARE * max(camera.width, 1)
-        return cls(mean, np.asarray(sigma, dtype=float), _log_aspect(mean))
+        return cls(mean, np.asarray(sigma, dtype=float), float(np.log(mean[1] / mean[0])))
 
     @classmethod
     def unknown(cls, camera: CameraModel) -> LensPrior:

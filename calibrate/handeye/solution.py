@@ -13,7 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from calibrate.chain import Chain
-from calibrate.errors import require_choice
+from calibrate.errors import require_choice, require_positive
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.noise_scales import MeasurementNoise
@@ -70,6 +70,13 @@ class SolveOptions:
 
     def __post_init__(self) -> None:
         require_choice("profile", self.profile, get_args(Profile))
+        require_positive(
+            working_distance_m=self.working_distance_m,
+            robot_accuracy_m=self.robot_accuracy_m or None,
+            robot_accuracy_rad=self.robot_accuracy_rad or None,
+        )
+        for sigma in self.lens_sigma or ():
+            require_positive(lens_sigma=sigma)
 
 
 _EXPLAINED = 4.0

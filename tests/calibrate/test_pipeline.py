@@ -19,7 +19,7 @@ from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.job import JobOptions, SolvedRecording
-from calibrate.pipeline import solve_recording, with_board_poses
+from calibrate.pipeline import prepare_views, solve_recording, solver_options, with_board_poses
 from calibrate.views import ViewSet
 from recordings.importers.folder import import_folder
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
@@ -88,6 +88,16 @@ def test_a_wrong_board_is_refused_with_what_was_seen(tmp_path: Path) -> None:
     path = write_session(tmp_path / "s.mcap", Scene(views=1))
     with raises("too-few-views", TooFewViewsError, views=0):
         solve_recording(path, JobOptions(board=BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)))
+
+
+def test_a_number_held_fixed_leaves_the_others_their_stated_error(
+    real_session_file: Path,
+) -> None:
+    camera = CameraModel(480, 384, ((620.0, 0, 243), (0, 620, 189), (0, 0, 1)), (-0.1, 0.2, 0.0, 0.0, 0.0))
+    options = JobOptions(camera=camera, camera_sigma={"fx": 17.0, "fy": 16.0, "k1": 0.3, "k3": 0.0})
+    sigma = solver_options(options, prepare_views(real_session_file, options)).lens_sigma
+    assert sigma is not None and sigma[:2] == (17.0, 16.0) and sigma[4] == 0.3
+    assert 0 < sigma[8] < 1e-6 and sigma[2] > 0.1
 
 
 def test_a_lens_of_another_camera_never_passes(real_session_file: Path) -> None:

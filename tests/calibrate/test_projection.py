@@ -19,3 +19,9 @@ def test_pixels_are_opencvs(model):
     function = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
     expected = function(points()[:, None], zero, zero, K, d)[0].reshape(-1, 2)
     np.testing.assert_allclose(project(camera, points()).pixels, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_nothing_is_seen_behind_the_camera(model):
+    """Else a board has a mirrored twin there, with the same pixels."""
+    assert np.isnan(project(LENSES[model], np.array([[0.1, 0.05, -1.0], [0.1, 0.05, 0.0]])).pixels).all()

@@ -74,7 +74,7 @@ def all_pairs(H: Array, camera_from_board: Array, limit: int = MAX_PAIRS) -> Pai
     if n * (n - 1) // 2 <= limit:
         first, second = np.triu_indices(n, 1)
     else:
-        steps = np.unique(np.linspace(1, n // 2, max(1, limit // n)).astype(int))
+        steps = np.unique(np.linspace(1, n // 2, max(3, limit // n)).astype(int))
         i = np.repeat(np.arange(n), len(steps))
         j = (i + np.tile(steps, n)) % n
         first, second = np.minimum(i, j), np.maximum(i, j)

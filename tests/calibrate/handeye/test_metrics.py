@@ -24,7 +24,7 @@ def turns(first_deg, second_deg, misfit_deg=0.0):
 
 
 def test_the_axes_are_those_that_were_turned_about():
-    spread, directions = axis_spread(turns(20, 5))
+    spread, directions = axis_spread(turns(20, 5).alpha)
     assert np.degrees(spread) == pytest.approx([20, 5, 0])
     np.testing.assert_allclose(np.abs(directions), np.eye(3), atol=1e-9)
     seen = observe(turns(20, 5), np.eye(6), 0.5, "flange")

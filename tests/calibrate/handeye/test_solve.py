@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from benchmarks.scene import random_rotation
-from calibrate.errors import BadViewsError, CalibrationError, DegenerateMotionError, TooFewViewsError
+from calibrate.errors import (
+    BadViewsError,
+    CalibrationError,
+    DegenerateMotionError,
+    TooFewViewsError,
+    UsageError,
+)
 from calibrate.geometry import (
     Array,
     inverse,
@@ -18,9 +24,10 @@ from calibrate.geometry import (
     pose_from_quaternion,
     rotation_exp,
 )
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet
-from tests.calibrate.cells import LOW, MID, MOUNTS, QUICK, error_mm_deg, exact_motions, make_cell
+from tests.calibrate.cells import LOW, MID, MOUNTS, QUICK, changed, error_mm_deg, exact_motions, make_cell
 from tests.codes import raises
 
 ROOT = Path(__file__).parents[3]
@@ -112,6 +119,48 @@ def test_one_axis_is_refused_and_named(profile):
     with pytest.raises((DegenerateMotionError, BadViewsError)) as refused:
         solve_views(poses_only(H, C), SolveOptions(profile=profile))
     assert refused.value.code in {"one-axis", "poses-disagree"}
+
+
+def test_a_wrong_pose_is_no_second_axis():
+    """About one axis with the error of one robot pose X has a "best" answer, far outside its own region."""
+    rng = np.random.default_rng(0)
+    cell = make_cell(rng, 15, LOW)
+    turns = rotation_exp(np.linspace(-0.4, 0.4, 15)[:, None] * np.array([0.0, 1.0, 0.0]))
+    C = pose(turns, cell.C[0, :3, 3] + rng.normal(size=(15, 3)) * 0.02) @ cell.C[0]
+    C[:, :3, 3] = cell.C[0, :3, 3] + rng.normal(size=(15, 3)) * 0.02
+    H = perturb(cell.Y @ inverse(C) @ inverse(cell.X), rng.normal(size=(15, 6)) * 1e-4)
+    H[4] = perturb(H[4], np.array([0.03, 0.0, 0.02, 0.1, 0.2, 0.1]))
+    with pytest.raises((DegenerateMotionError, BadViewsError)) as refused:
+        solve_views(poses_only(H, C), SolveOptions(model_arm=False))
+    assert refused.value.code in {"one-axis", "poses-disagree"}
+
+
+def test_exact_poses_say_nothing_of_arm_and_bracket():
+    cell = make_cell(np.random.default_rng(0), 15, MeasurementNoise(0.0, 0.0, 0.0), with_pnp=False)
+    solution = solve_views(poses_only(cell.views.base_from_flange, cell.C))
+    assert {remark.code for remark in solution.warnings} <= {"no-corners"}
+    assert error_mm_deg(solution.matrix, cell.X)[0] < 1e-3
+
+
+def test_corners_in_a_line_are_refused():
+    cell = make_cell(np.random.default_rng(0), 6, LOW)
+    row = {"pixels": lambda view: view.pixels[:6], "board_points": lambda view: view.board_points[:6]}
+    with raises("corners-in-line", BadViewsError):
+        solve_views(changed(cell.views, [2], **row))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"robot_accuracy_m": float("nan")},
+        {"robot_accuracy_rad": -1.0},
+        {"working_distance_m": -0.5},
+        {"lens_sigma": (1.0, 1.0, 0.0)},
+    ],
+)
+def test_numbers_that_measure_nothing_are_refused(wrong):
+    with raises("not-positive", UsageError):
+        SolveOptions(**wrong)
 
 
 def test_identical_views_are_refused():

@@ -2,7 +2,13 @@ import numpy as np
 
 from benchmarks.scene import random_rotation
 from calibrate.geometry import inverse, pose
-from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses, screw_invariants
+from calibrate.handeye.axxb.pairs import (
+    MAX_PAIRS,
+    all_pairs,
+    consecutive_pairs,
+    mount_poses,
+    screw_invariants,
+)
 from tests.calibrate.cells import MOUNTS, exact_motions, make_cell
 
 
@@ -39,3 +45,11 @@ def test_screw_invariants_do_not_depend_on_the_camera():
     again_angle, again_along = screw_invariants(X @ pairs.A @ inverse(X))
     np.testing.assert_allclose(angle, again_angle, atol=1e-6)
     np.testing.assert_allclose(along, again_along, atol=1e-6)
+
+
+def test_above_the_limit_pairs_still_reach_across_the_session():
+    n = MAX_PAIRS // 2 + 1
+    H = np.broadcast_to(np.eye(4), (n, 4, 4))
+    pairs = all_pairs(H, H)
+    apart = pairs.second - pairs.first
+    assert len(pairs) <= 3 * n and ((apart > n // 5) & (apart < 4 * n // 5)).sum() >= n

@@ -11,6 +11,7 @@ from calibrate.errors import InstallError
 from calibrate.files.folders import calibrations_folder
 from calibrate.files.lines import append_line, read_lines
 from recordings.files import MAIN_CAMERA
+from recordings.schema.messages import BoardSpec
 
 FILE = "checks.jsonl"
 
@@ -45,6 +46,8 @@ class CheckEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     right: tuple[float, ...] = ()
     information_lower: tuple[float, ...] = ()
     """`DriftCheck.evidence`: its right side, and the lower triangle of its information, row by row."""
+    board: BoardSpec | None = None
+    """None: the calibration's own. Only checks of one board make a trend, as another is of another size."""
 
 
 def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN_CAMERA) -> None:

@@ -5,21 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import special
 
-from calibrate.check.drift import DriftCheck
+from calibrate.check.drift import DriftCheck, limit
 from calibrate.check.history import CheckEntry, Trend
 from calibrate.handeye.cell_state import Quadratic
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.uncertainty import inverse_of
+from recordings.schema.messages import BoardSpec
 
 FEWEST_FOR_TREND = 5
 """Fewest drift checks from which a trend is estimated."""
 _TREND_P = 0.01
 
 
-def entry_of(check: DriftCheck, wall_s: float, generation: int, recording: str) -> CheckEntry:
-    """Make the line of a check."""
+def entry_of(
+    check: DriftCheck, wall_s: float, generation: int, recording: str, board: BoardSpec | None = None
+) -> CheckEntry:
+    """Make the line of a check by views of `board`; None: the calibration's own."""
     evidence = check.evidence or Quadratic(np.zeros((0, 0)), np.zeros(0))
     return CheckEntry(
         wall_s,
@@ -31,6 +33,7 @@ def entry_of(check: DriftCheck, wall_s: float, generation: int, recording: str) 
         check.threshold,
         right=tuple(evidence.right.tolist()),
         information_lower=tuple(evidence.N[np.tril_indices(len(evidence.N))].tolist()),
+        board=board,
     )
 
 
@@ -41,14 +44,17 @@ def _evidence(entry: CheckEntry) -> Quadratic:
     return Quadratic(N + np.tril(N, -1).T, np.array(entry.right))
 
 
-def find_trend(history: Sequence[CheckEntry], generation: int, known: KnownCell) -> Trend | None:
-    """Look for a trend in the checks of this installed version; None where chance explains it.
+def find_trend(
+    history: Sequence[CheckEntry], generation: int, known: KnownCell, board: BoardSpec | None = None
+) -> Trend | None:
+    """Look for a trend in the checks of this installed version and one board; None where chance explains it.
 
-    The checks are solved together: lens, board and arm are the same in all, the camera's pose moves along a
-    straight line of six slopes. These are tested by χ² with 6 degrees of freedom at 1 %.
+    board: the calibration's own where None; `known` is what is known before its views. The checks are solved
+    together: lens, board and arm are the same in all, the camera's pose moves along a straight line of six
+    slopes. These are tested at 1 % like the shift of one check, as all have the calibration's noise.
     """
     size = len(known.covariance)
-    entries = [e for e in history if e.generation == generation and len(e.right) == size]
+    entries = [e for e in history if e.generation == generation and e.board == board and len(e.right) == size]
     if len(entries) < FEWEST_FOR_TREND:
         return None
     days = np.array([entry.wall_s for entry in entries]) / 86400
@@ -67,7 +73,7 @@ def find_trend(history: Sequence[CheckEntry], generation: int, known: KnownCell)
     covariance = inverse_of(N)
     slope = (covariance @ right)[6:12]
     statistic = float(slope @ np.linalg.solve(covariance[6:12, 6:12], slope))
-    if special.chdtrc(6, statistic) > _TREND_P:
+    if statistic <= limit(known.freedom, _TREND_P):
         return None
     millimetres = float(np.linalg.norm(slope[:3]) * 1e3 * span)
     degrees = float(np.degrees(np.linalg.norm(slope[3:])) * span)

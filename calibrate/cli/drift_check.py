@@ -32,7 +32,7 @@ from recordings.files import MAIN_CAMERA, state_root
 from recordings.importers.dataset import DATASET_FILE
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
-from recordings.schema.messages import SessionInfo
+from recordings.schema.messages import BoardSpec, SessionInfo
 
 DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
@@ -61,7 +61,7 @@ def drift_check(
 
     The board may lie elsewhere by now. The result states the power to detect 0.5 mm or 0.1°, and how many
     more views are needed. Every drift check of the installed calibration is logged, and a trend over five or
-    more is reported. `station drift-check` captures the views.
+    more of one board is reported. `station drift-check` captures the views.
 
     A folder with dataset.yaml and poses.csv holds production pictures: one tag or small board (--board) that
     is fixed in the cell (eye-to-hand: on the gripper) and shows up in pictures that are taken anyway, while
@@ -98,7 +98,7 @@ def drift_check(
         text = check_text(result, calibration)
         own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
         if noted is not None and not own:
-            before, trend = _log(noted, result, calibration, info)
+            before, trend = _log(noted, result, calibration, info, prepared.loaded.board)
             validity = _judge(noted, result, info.name, _taken(info))
     proves_nothing = own and result.passed
     if as_json:
@@ -151,12 +151,13 @@ def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibrat
 
 
 def _log(
-    noted: _Noted, result: DriftCheck, calibration: Calibration, info: SessionInfo
+    noted: _Noted, result: DriftCheck, calibration: Calibration, info: SessionInfo, looked_at: BoardSpec
 ) -> tuple[list[bool], Trend | None]:
     """Log the check: results of the earlier ones of the installed calibration, and the trend with it."""
     before = read_checks(noted.root, noted.camera)
-    entry = entry_of(result, _taken(info).timestamp(), noted.version, info.name)
-    trend = find_trend([*before, entry], noted.version, known_cell(calibration))
+    board = None if looked_at == calibration.board else looked_at
+    entry = entry_of(result, _taken(info).timestamp(), noted.version, info.name, board)
+    trend = find_trend([*before, entry], noted.version, known_cell(calibration, board), board)
     append_check(msgspec.structs.replace(entry, trend=trend), noted.root, noted.camera)
     return earlier_results(before, noted.version), trend
 

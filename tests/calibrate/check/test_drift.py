@@ -28,7 +28,7 @@ from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import intrinsics_vector, project_at, with_intrinsics_vector
 from calibrate.views import BoardView, ViewSet, extent_of
-from recordings.schema.messages import CameraModel, Mount
+from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from tests.calibrate.cells import MOUNTS, QUICK, changed
 from tests.calibrate.chains import arm_cell, later_views
 from tests.calibrate.sessions import PAPER_BOARD, X_TRUE, looking
@@ -232,14 +232,14 @@ def test_too_few_or_untelling_views_are_refused() -> None:
 KNOWN = installed()
 
 
-def entry(day: float, shift_mm: float, generation: int = 1) -> CheckEntry:
+def entry(day: float, shift_mm: float, generation: int = 1, board: BoardSpec | None = None) -> CheckEntry:
     """A check that tells X ⊕ δ to 0.05 mm and 1e-5 rad, and nothing of lens and board."""
     N = np.zeros((len(SIGMA), len(SIGMA)))
     N[:6, :6] = np.diag(np.r_[np.full(3, 0.05e-3), np.full(3, 1e-5)] ** -2.0)
     shift = np.r_[shift_mm / 1e3, np.zeros(5)]
     check = quiet_check()
     evidence = Quadratic(N, N[:, :6] @ shift)
-    return entry_of(replace(check, evidence=evidence, shift=shift), day * 86400, generation, "r")
+    return entry_of(replace(check, evidence=evidence, shift=shift), day * 86400, generation, "r", board)
 
 
 def test_a_trend_is_found_before_a_check_fails(tmp_path: Path) -> None:
@@ -256,12 +256,22 @@ def test_a_trend_is_found_before_a_check_fails(tmp_path: Path) -> None:
     assert earlier_results(steady, 2) == []
 
 
-def test_a_trend_is_told_from_chance_at_one_percent() -> None:
-    """The slope of eight days has a variance of σ² / 42; its square follows χ²(6)."""
-    slope_mm = 0.05 * np.sqrt(stats.chi2.ppf(0.99, 6) / 42)
+@pytest.mark.parametrize("freedom", [9.0, 69.0])
+def test_a_trend_is_told_from_chance_at_one_percent(freedom: float) -> None:
+    """The slope of eight days has a variance of σ² / 42; σ is the calibration's, its square follows 6·F."""
+    slope_mm, known = 0.05 * np.sqrt(6 * stats.f.ppf(0.99, 6, freedom) / 42), replace(KNOWN, freedom=freedom)
     for factor in (0.99, 1.01):
-        wandering = find_trend([entry(day, 0.3 + factor * slope_mm * day) for day in range(8)], 1, KNOWN)
+        wandering = find_trend([entry(day, 0.3 + factor * slope_mm * day) for day in range(8)], 1, known)
         assert bool(wandering) == (factor > 1)
+
+
+def test_another_board_is_not_a_step_of_the_trend() -> None:
+    """Printed larger, it shows the camera elsewhere in each of its checks; its own trend is found."""
+    swapped = [entry(day, 0.5 * (day > 2), board=PAPER_BOARD if day > 2 else None) for day in range(6)]
+    assert find_trend(swapped, 1, KNOWN) is None and find_trend(swapped, 1, KNOWN, PAPER_BOARD) is None
+    creeping = [*swapped, *(entry(day, 0.5 * day, board=PAPER_BOARD) for day in range(6, 12))]
+    trend = find_trend(creeping, 1, KNOWN, PAPER_BOARD)
+    assert trend is not None and trend.checks == 9 and find_trend(creeping, 1, KNOWN) is None
 
 
 def test_four_checks_or_one_moment_are_no_trend() -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from calibrate import load_installed
+from calibrate.check.history import read_checks
 from calibrate.errors import InstallError
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
@@ -90,7 +91,11 @@ def test_solve_install_check_rollback(real_session_file: Path, real_file: Path, 
     installed = run("install", second, "--json", cwd=tmp_path)
     assert json.loads(installed.stdout)["generation"] == 2
     assert run("drift-check", real_session_file, cwd=tmp_path).returncode == 4
-    assert run("drift-check", new, cwd=tmp_path).returncode == 4
+    other = msgspec.structs.replace(later.board, flatness_m=0.002)
+    (tmp_path / "board.yaml").write_bytes(msgspec.json.encode(other))
+    assert run("drift-check", new, "--board", "board.yaml", cwd=tmp_path).returncode == 4
+    logged = read_checks(tmp_path / "state/calibration-station")
+    assert [entry.board for entry in logged] == [None, other]
     _everything_says_that_it_is_in_doubt(tmp_path)
     assert run("rollback", "--reason", "moved", cwd=tmp_path).returncode == 0
     listed = json.loads(run("list", "--json", cwd=tmp_path).stdout)

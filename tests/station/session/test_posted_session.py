@@ -45,7 +45,7 @@ class RecordedCamera(CameraInMemory):
 async def test_what_the_station_takes_by_itself_gives_the_calibration_of_the_same_stops(
     tmp_path: Path,
 ) -> None:
-    """Each stop is held until it is taken, or seen to be none: six of these 25 are too much like others."""
+    """Each stop is held until it is taken, or seen to be none: two of these 25 are too much like others."""
     recorded = open_recording(SAMPLE)
     info, views = recorded.info, recorded.views()
     config: StationConfig = msgspec.structs.replace(

@@ -39,6 +39,7 @@ from calibrate.projection import intrinsics_names
 from calibrate.recorded_views import LoadedViews
 from calibrate.results import Gate, Remark
 from calibrate.views import ViewSet
+from recordings.plain_text import plain_text
 from recordings.reader import Recording
 from recordings.schema.messages import BoardKind
 
@@ -84,7 +85,7 @@ def make_calibration(
         ),
         quality=_quality(solution, gates, loaded, intrinsics),
         provenance=Provenance(
-            recording=recording.path.name,
+            recording=plain_text(recording.path.name),
             recording_sha256=recording.sha256,
             session=info.name,
             software=software_versions(),

@@ -9,8 +9,9 @@ from __future__ import annotations
 import re
 from typing import Any
 
-ORDERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
-"""Control characters but for tab and line feed, and marks that turn the direction of writing."""
+ORDERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Control characters but for tab and line feed, marks that turn the direction of writing, and what Python
+makes of bytes that are no UTF-8."""
 SIGN = "\N{REPLACEMENT CHARACTER}"
 
 

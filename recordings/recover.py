@@ -149,7 +149,7 @@ def _recover_file(source: Path, output: Path | None) -> Recovery:
             segment = RecordingSegment(source)
         except (UnfinishedRecordingError, CorruptRecordingError):
             return _rebuild(descriptor, source, final, in_place=output is None)
-        if source.name.endswith(PART_SUFFIX):  # only its last rename was missing
+        if output is None and source.name.endswith(PART_SUFFIX):  # only its last rename was missing
             rename_new(source, final)
             source = final
         return _told(source, segment)

@@ -23,6 +23,7 @@ from calibrate.files.proof import content_sha256
 from calibrate.job import JobOptions, SolvedRecording
 from calibrate.pipeline import solve_recording
 from recordings.errors import RecordingError
+from recordings.plain_text import plain_text
 
 RESULTS = "results.jsonl"
 
@@ -83,6 +84,8 @@ def run_batch(
                 if isinstance(answer, Lost):
                     answer = BatchResult(recording, key, False, error=answer.reason), b""
                 result, content = answer
+                said = {"recording": plain_text(recording), "error": plain_text(result.error)}
+                result = msgspec.structs.replace(result, **said)
                 if content:
                     write_output(output / result.calibration, content)
                 done[key] = result
@@ -95,11 +98,15 @@ def run_batch(
 
 
 def batch_key(recording: Path, options: JobOptions) -> str:
-    """Key that changes with the recording's place, size and date, options of the result, and the software."""
-    found: list[str | int] = [os.path.realpath(recording), 0, 0]
+    """Key that changes with the recording's place, size and date, options of the result, and the software.
+
+    Of a session folder with size and date of each file in it.
+    """
+    found: list[tuple[bytes, int, int]] = []
     with suppress(OSError):
-        stat = recording.stat()
-        found[1:] = [stat.st_size, stat.st_mtime_ns]
+        for file in sorted(recording.iterdir()) if recording.is_dir() else [recording]:
+            stat = file.stat()
+            found.append((os.fsencode(os.path.realpath(file)), stat.st_size, stat.st_mtime_ns))
     chosen = {name: msgspec.to_builtins(value) for name, value in vars(options).items() if name != "threads"}
     parts = [found, chosen, software_versions()]
     return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()[:24]
@@ -121,7 +128,8 @@ def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tup
     except Exception as problem:  # a defect in one recording must not stop the other 199
         error = f"internal error: {type(problem).__name__}: {problem}"
         return BatchResult(recording, key, False, error=error), b""
-    return _result(recording, key, job, f"{Path(recording).stem}-{key[:8]}.calibration.yaml"), content
+    name = plain_text(Path(recording).stem)[:50]  # with all else short enough for every file system
+    return _result(recording, key, job, f"{name}-{key[:8]}.calibration.yaml"), content
 
 
 def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchResult:

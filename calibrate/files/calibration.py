@@ -43,6 +43,7 @@ from recordings.schema.messages import (
     RobotIdentity,
     Source,
     Vector6,
+    WallTime,
 )
 
 _STAMPS = {
@@ -314,7 +315,7 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
     profile: str
     seed: int
     options: dict[str, Any] = {}
-    recorded_wall_ns: int = 0
+    recorded_wall_ns: WallTime = 0
     plan_sha256: str = ""
 
 

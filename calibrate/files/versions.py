@@ -45,6 +45,7 @@ from calibrate.files.touch import LIMIT_SIGMAS, Touch, agrees, touch_sigmas, tou
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, time_text, unrecorded
 from recordings.files import MAIN_CAMERA, open_regular, sync_folder, write_atomically
+from recordings.plain_text import plain_text
 
 Action = Literal["install", "rollback", "verify"]
 
@@ -225,7 +226,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 def who() -> str:
     try:
-        return getpass.getuser()
+        return plain_text(getpass.getuser())
     except (OSError, KeyError):
         return f"uid {os.getuid()}"
 

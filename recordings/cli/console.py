@@ -30,7 +30,7 @@ def print_json(value: object) -> None:
 
 
 def _plain_value(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else plain_text(os.fspath(value))
 
 
 def plain_console(**settings: Any) -> Console:

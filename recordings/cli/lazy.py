@@ -17,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from recordings.errors import CodedError, ErrorReport
-from recordings.plain_text import plain_text, printed
+from recordings.plain_text import plain_data, plain_text, printed
 
 _HELP_KEYS = {"help_option_names": ["-h", "--help"]}
 _EXTRAS = {
@@ -178,9 +178,11 @@ def run(name: str, group: LazyGroup) -> None:
         extra = f"pip install 'calibration-station[{_EXTRAS[package]}]'"
         print(f"{name}: this command needs the package {package}: {extra}", file=sys.stderr)
         sys.exit(2)
-    except CodedError as problem:
+    except (CodedError, UnicodeEncodeError) as problem:
+        if isinstance(problem, UnicodeEncodeError):
+            problem = CodedError("not-utf-8", given=plain_text(problem.object))
         if "--json" in sys.argv:
-            print(msgspec.json.encode(ErrorReport(problem.data)).decode())
+            print(msgspec.json.encode(plain_data(msgspec.to_builtins(ErrorReport(problem.data)))).decode())
         print(f"{name}: {printed(problem)}", file=sys.stderr)
         sys.exit(problem.exit_code)
     except OSError as problem:  # a folder that may not be written, a full disk behind stdout

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from recordings.errors import disk_error, exists_error
+from recordings.errors import RecordingError, disk_error, exists_error
 from recordings.exporters import Target
 from recordings.files import sync_folder
 from recordings.images import encode_png, mosaic_encoding, viewable
@@ -41,6 +41,8 @@ def _new_folder(output: Path) -> Iterator[Path]:
     if output.exists() or output.is_symlink():
         raise exists_error(output)
     temporary = output.with_name(output.name + ".part")
+    if temporary.exists():
+        raise RecordingError("export-begun", path=temporary)
     try:
         temporary.mkdir()
         try:
@@ -75,13 +77,13 @@ def _write_folder(recording: Recording, folder: Path) -> None:
 
 
 def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
-    """Write the image as stored, a raw or Bayer one as PNG; return its row of poses.csv."""
+    """Write a PNG or JPEG image as stored, any other or a Bayer one as PNG; return its row of poses.csv."""
     image = recording.image(view)
     stored = recording.stored_image(view)
-    if stored is None or mosaic_encoding(image.pixel_format):
+    if stored is None or stored[0] not in _EXTENSIONS or mosaic_encoding(image.pixel_format):
         stored = "png", encode_png(viewable(image.pixels, image.pixel_format))
     extension, data = stored
-    name = f"images/{view.index:03d}.{_EXTENSIONS.get(extension, extension)}"
+    name = f"images/{view.index:03d}.{_EXTENSIONS[extension]}"
     (folder / name).write_bytes(data)
     T = view.base_from_flange
     return [name, T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]

@@ -19,6 +19,8 @@ Source = Literal["real", "simulated", "playback", "imported"]
 """Origin of images and poses; anything but `real` never installs on a real cell."""
 
 Vector6 = tuple[float, float, float, float, float, float]
+WallTime = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+"""Nanoseconds since 1970, UTC; 0: not known."""
 Joints = Annotated[tuple[float, ...], msgspec.Meta(min_length=5, max_length=7)]
 """One number a joint, base first; an arm has five to seven."""
 ToldJoints = Annotated[tuple[float, ...], msgspec.Meta(max_length=7)]
@@ -133,7 +135,7 @@ class SessionInfo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     camera_identity: CameraIdentity = CameraIdentity()
     part: int = 1
     """A resumed session continues in part 2, 3 …"""
-    created_wall_ns: int = 0
+    created_wall_ns: WallTime = 0
     plan_sha256: str = ""
     config_sha256: str = ""
     software: dict[str, str] = {}

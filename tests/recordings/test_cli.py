@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import subprocess
 from pathlib import Path
@@ -117,10 +118,19 @@ def test_the_command_that_is_offered_works_for_any_name(small: Path, tmp_path: P
     assert shlex.split(offered) == [str(path)]
 
 
-def test_recover_of_a_whole_file_says_that_no_output_was_made(small: Path, tmp_path: Path) -> None:
-    result = run("recover", small, "-o", tmp_path / "b.mcap")
-    assert result.returncode == 0
+@pytest.mark.parametrize("name", ["a.mcap", "a.mcap.part"])
+def test_recover_of_a_whole_file_says_that_no_output_was_made(small: Path, tmp_path: Path, name: str) -> None:
+    whole = small.rename(tmp_path / name)
+    result = run("recover", whole, "-o", tmp_path / "b.mcap")
+    assert result.returncode == 0 and whole.exists()
     assert "b.mcap" in result.stdout and not (tmp_path / "b.mcap").exists()
+
+
+def test_a_name_that_is_no_utf_8_is_printed_all_the_same(small: Path, tmp_path: Path) -> None:
+    strange = small.rename(os.fsdecode(os.fsencode(tmp_path) + b"/b\xff.mcap"))
+    for option in ((), ("--json",)):
+        assert run("info", strange, *option).returncode == 0
+        assert run("info", f"{strange}.none", *option).returncode == 1
 
 
 def test_recover_ends_with_3_when_it_had_to_rebuild_and_with_0_when_not(tmp_path: Path) -> None:

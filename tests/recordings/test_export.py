@@ -65,7 +65,7 @@ def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: P
 def test_an_export_that_fails_halfway_leaves_nothing(small: Path, tmp_path: Path) -> None:
     recording = open_recording(small)
     (tmp_path / "out.part").mkdir()
-    with refused("disk", errno=errno.EEXIST):
+    with refused("export-begun", path=str(tmp_path / "out.part")):
         export_recording(recording, tmp_path / "out", "folder")
     assert not (tmp_path / "out").exists()
 
@@ -85,6 +85,14 @@ def test_a_full_disk_leaves_no_half_of_a_recording_that_can_be_made_again(
     with refused("disk", errno=errno.ENOSPC):
         import_folder(folder, output)
     assert not list(tmp_path.glob("out*"))
+
+
+def test_an_image_of_a_format_that_names_no_file_is_written_as_png(small: Path, tmp_path: Path) -> None:
+    recording = open_recording(small)
+    png = encode_png(recording.image(recording.views()[0]).pixels)
+    recording.stored_image = lambda view: ("../p\0", png)  # type: ignore[method-assign]
+    out = export_recording(recording, tmp_path / "out", "folder")
+    assert {path.name for path in (out / "images").iterdir()} == {"000.png", "001.png", "002.png"}
 
 
 @pytest.mark.parametrize("target", ["folder", "ros2"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import struct
 import time
@@ -119,8 +120,8 @@ def bomb(compression: str) -> bytes:
     return with_chunk(b"", compression=compression, stored=packed, size=BOMB_BYTES)
 
 
-def future_session() -> bytes:
-    described = msgspec.json.encode({**msgspec.to_builtins(make_info()), "gravity": 9.81}).decode()
+def other_session(**changes: object) -> bytes:
+    described = json.dumps({**msgspec.to_builtins(make_info()), **changes})
     return metadata("session", {"format": "station-recording/1", "session": described})
 
 
@@ -168,7 +169,8 @@ UNUSABLE = {
         sealed(SESSION.replace(b"eye-in-hand", b"eye-to-hand")),
         "contradiction",
     ),
-    "a session description of the future": (sealed(future_session()), "contradiction"),
+    "a session description of the future": (sealed(other_session(gravity=9.81)), "contradiction"),
+    "a session at no time": (sealed(other_session(created_wall_ns=10**30)), "contradiction"),
     "session named a path": (sealed(session_metadata(make_info(name="../x"))), "contradiction"),
     "session is no JSON": (
         sealed(metadata("session", {"format": "station-recording/1", "session": "[" * 9000})),

@@ -121,6 +121,20 @@ def test_other_options_or_a_changed_recording_are_solved_again(
         assert key != batch_key(recordings[0], JobOptions())
     os.utime(recordings[0], (1, 1))
     assert key != batch_key(recordings[0], JobOptions())
+    folder = recordings[0].parent
+    before, told = batch_key(folder, JobOptions()), folder.stat()
+    recordings[1].write_bytes(b"new data")
+    os.utime(folder, ns=(told.st_atime_ns, told.st_mtime_ns))
+    assert before != batch_key(folder, JobOptions())
+
+
+def test_a_name_may_be_long_and_of_any_bytes(recordings: list[Path], tmp_path: Path) -> None:
+    names = "é" * 120 + ".mcap", os.fsdecode(b"b\xff.mcap")
+    named = [path.rename(tmp_path / name) for path, name in zip(recordings[1:], names, strict=True)]
+    results = run_batch([*named, recordings[0]], tmp_path / "out", workers=in_this_process)
+    assert [result.error for result in results] == ["", "", ""]
+    assert all((tmp_path / "out" / result.calibration).exists() for result in results)
+    assert read_results(tmp_path / "out") == results
 
 
 def of_session(leader: int) -> set[int]:

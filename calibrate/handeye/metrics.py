@@ -98,8 +98,6 @@ def require_motion(pairs: Pairs) -> None:
             )
 
 
-_ON_A_LINE = 1e-6
-"""Width of a view's corners across their line, as a share of their length, that fixes no pose."""
 FEWEST_TO_SOLVE = 4
 """Fewest views of a solve."""
 FEWEST_CORNERS_IN_VIEW = 4
@@ -145,8 +143,8 @@ def _require_view(view: BoardView, fewest_corners: int) -> None:
     right = bool(fewest_corners <= corners == points and finite)
     require(right, "corners", corners=corners, points=points, minimum=fewest_corners)
     if corners:
-        spread = np.linalg.svd(view.board_points - np.mean(view.board_points, axis=0), compute_uv=False)
-        require(bool(spread[1] > _ON_A_LINE * spread[0]), "corners-in-line")
+        away = view.board_points - np.mean(view.board_points, axis=0)
+        require(bool(np.linalg.matrix_rank(away) > 1), "corners-in-line")
 
 
 def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> Observability:

@@ -112,6 +112,7 @@ def estimate_with_arm_errors(
         weights = corner_weights(observed, state, best.scales.sigma_px)
         converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
     sigma = chances @ np.array([sizes.sigma(one) for one in kept])
+    of_X = covariance[:6, :6]
     classes = np.einsum("s,snk->nk", chances, [s.chances for s in solutions])
     with_errors = replace(
         plain,
@@ -130,7 +131,7 @@ def estimate_with_arm_errors(
         steps=steps,
         converged=converged,
         # Variances of X in each part over that of the mixture, averaged over directions.
-        mean_of=MeanParts(chances, np.trace(inverse_of(covariance[:6, :6]) @ spread[:, :6, :6], 0, 1, 2) / 6),
+        mean_of=MeanParts(chances, np.einsum("ij,sji->s", inverse_of(of_X) / 6, spread[:, :6, :6])),
     )
     return with_errors, log_bayes
 

@@ -27,7 +27,7 @@ def inverse_of(N: Array) -> Array:
         np.fill_diagonal(half, half.diagonal() / 2)
         return np.asarray((half + half.T) * np.outer(scale, scale))
     # Not divide and conquer: it fails for about one matrix in a thousand.
-    values, vectors = linalg.eigh(scaled, driver="ev")
+    values, vectors = linalg.eigh(scaled, driver="ev", check_finite=False)
     if not values[0] > -_ROUNDING:
         raise np.linalg.LinAlgError("some unknowns are left open")
     root = vectors * scale[:, None]

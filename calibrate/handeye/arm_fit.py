@@ -111,13 +111,12 @@ def estimate_with_arm_errors(
         best = solutions[int(chances.argmax())]
         weights = corner_weights(observed, state, best.scales.sigma_px)
         converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
-    sigma = chances @ np.array([sizes.sigma(one) for one in kept])
     of_X = covariance[:6, :6]
     classes = np.einsum("s,snk->nk", chances, [s.chances for s in solutions])
     with_errors = replace(
         plain,
         state=state,
-        scales=replace(best.scales, arm_error_sigma=sigma),
+        scales=replace(best.scales, arm_error_sigma=chances @ np.array([sizes.sigma(one) for one in kept])),
         chances=classes,
         weight=linear.weights(classes, best.scales),
         covariance=covariance,

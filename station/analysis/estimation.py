@@ -115,7 +115,10 @@ def quick_covariance(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_
     flange = views.base_from_flange
     each = view_information(views.mount, views.camera, flange, X, Y, points, USUAL_NOISE)
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
-    return covariance_of(each.sum(axis=0), prior)[:6, :6]
+    covariance = covariance_of(each.sum(axis=0), prior)[:6, :6]
+    if not np.isfinite(covariance).all():
+        raise np.linalg.LinAlgError("the board is out of sight")
+    return covariance
 
 
 def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:

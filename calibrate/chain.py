@@ -199,24 +199,29 @@ _QUICK = 1
 """Starts of a trial that is expected to fail: where joints fit, nearly every start explains them."""
 
 
-def read_otherwise(joints_rad: Array, flanges: Array) -> tuple[Array, str] | None:
-    """Find the reading of joints that do not explain the flanges: the joints so read, and what was done.
+def readings(joints_rad: Array) -> Iterator[tuple[Array, str]]:
+    """Yield joints as they stand, then read otherwise, and what was done.
 
-    Tried: degrees, two columns exchanged, a joint that also turns with the one before it.
+    Degrees, two columns exchanged, a joint that also turns with the one before it.
     """
+    yield joints_rad, ""
     columns = range(joints_rad.shape[1])
-    readings = [(np.radians(joints_rad), "read as degrees")]
+    yield np.radians(joints_rad), "read as degrees"
     for first, second in itertools.combinations(columns, 2):
         order = list(columns)
         order[first], order[second] = second, first
-        readings.append((joints_rad[:, order], f"with joints {first + 1} and {second + 1} exchanged"))
+        yield joints_rad[:, order], f"with joints {first + 1} and {second + 1} exchanged"
     for joint, sign in itertools.product(columns[1:], (-1.0, 1.0)):
         coupled = joints_rad.copy()
         coupled[:, joint] += sign * joints_rad[:, joint - 1]
         word = "minus" if sign < 0 else "plus"
-        readings.append((coupled, f"with joint {joint + 1} read as itself {word} joint {joint}"))
-    for joints, done in readings:
-        if learn_chain(joints, flanges, _QUICK).explains:
+        yield coupled, f"with joint {joint + 1} read as itself {word} joint {joint}"
+
+
+def read_otherwise(joints_rad: Array, flanges: Array) -> tuple[Array, str] | None:
+    """Find the reading of joints that do not explain the flanges: the joints so read, and what was done."""
+    for joints, done in readings(joints_rad):
+        if done and learn_chain(joints, flanges, _QUICK).explains:
             return joints, done
     return None
 

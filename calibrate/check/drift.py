@@ -9,7 +9,7 @@ estimate. Errors of lens and arm are the same in fit and check, so they are not 
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,8 @@ def known_cell(calibration: Calibration, board: BoardSpec | None = None) -> Know
     """
     camera = calibration.intrinsics.model
     if calibration.posterior is not None:
-        known = KnownCell.of(calibration.posterior, camera)
+        told = (calibration.transform.matrix, np.array(calibration.covariance))
+        known = replace(KnownCell.of(calibration.posterior, camera), installed=told)
     else:
         known = stated_cell(calibration)
     if board is None or board == calibration.board:

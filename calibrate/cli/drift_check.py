@@ -222,10 +222,8 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
         text = f"{verdict}: {frame} on {result.views} new views (p = {result.p_value:.2f})."
     if not result.arm_known:
         text += " The arm's own errors are unknown: a failure may be theirs. Solve with recorded joints."
-    text += (
-        f" Detection power: 0.5 mm {result.power_translation:.0%}, 0.1° {result.power_rotation:.0%}; "
-        "false alarms 5 %."
-    )
+    text += f" Detection power: 0.5 mm {result.power_translation:.0%}, 0.1° {result.power_rotation:.0%}"
+    text += "; false alarms 5 %." if result.arm_known else "."
     if result.passed and result.power < POWER:
         text += f" {_more_text(result, calibration)}"
     if result.disagreement > MOST_DISAGREEMENT:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibrate.chain import Chain
-from calibrate.geometry import Array
+from calibrate.chain import Chain, LearnedChain, readings
+from calibrate.geometry import Array, difference
 from calibrate.handeye.arm import flex_motion, gravity_in_flange, recorded_joints
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import CellState, Layout
@@ -78,6 +78,8 @@ class KnownCell:
     gravity: Array | None
     stated_arm_error: Array = field(default_factory=lambda: np.zeros((6, 6)))
     """(6, 6) as `Posterior.stated_arm_error`."""
+    installed: tuple[Array, Array] | None = None
+    """The file's X (4, 4) for flanges as they are told, and its covariance (6, 6); None: `mean`'s."""
 
     @property
     def knows_arm(self) -> bool:
@@ -129,20 +131,36 @@ class KnownCell:
         return KnownBefore(self.mean, information)
 
     def beside(self, views: ViewSet) -> KnownCell:
-        """Return what is known beside these views: not the arm's errors where their joints are not known."""
-        joints = recorded_joints(views)
-        if self.chain is None or (joints is not None and joints.shape[1] == len(self.chain.axes)):
+        """Return what is known beside these views: not the arm's errors where their joints are not known.
+
+        X is then the one for flanges as the controller tells them.
+        """
+        if self.chain is None or self._joints(views) is not None:
             return self
         rest = slice(0, len(self.covariance) - len(self.mean.arm_errors))
-        mean, covariance = replace(self.mean, arm_errors=np.zeros(0)), self.covariance[rest, rest]
+        mean, covariance = replace(self.mean, arm_errors=np.zeros(0)), self.covariance[rest, rest].copy()
+        if self.installed is not None:
+            mean = replace(mean, X=self.installed[0])
+            covariance[:6], covariance[:, :6] = 0.0, 0.0
+            covariance[:6, :6] = self.installed[1]
         return replace(self, mean=mean, covariance=covariance, chain=None, gravity=None)
+
+    def _joints(self, views: ViewSet) -> Array | None:
+        """Read the joints (n, k) as the fit did: as its chain explains the flanges. None where none does."""
+        joints, flanges = recorded_joints(views), views.base_from_flange
+        if self.chain is None or joints is None or joints.shape[1] != len(self.chain.axes):
+            return None
+        for read, _ in readings(joints):
+            if LearnedChain(self.chain, difference(self.chain.forward(read), flanges)).explains:
+                return read
+        return None
 
     def observe(self, views: ViewSet) -> Observations:
         """Observe new views with the errors of this arm and bracket; see `beside`."""
         observed = replace(observe_views(views), extent=self.extent)
-        columns = np.zeros((len(views), 6, 0))
-        if self.chain is not None:
-            columns = self.chain.by_links(np.array([view.joints_rad for view in views]))
+        columns, joints = np.zeros((len(views), 6, 0)), self._joints(views)
+        if self.chain is not None and joints is not None:
+            columns = self.chain.by_links(joints)
         if self.gravity is not None:
             flange = views.base_from_flange
             held = self.mean.X if views.mount == "eye-in-hand" else self.start(views).Y

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -111,7 +112,28 @@ def test_errors_of_an_arm_that_nobody_described_are_no_shift(mount: Mount) -> No
         still = find_shift(views, known)
         assert still.arm_known and still.p_value > 1e-3
         assert not find_shift(later_views(cell, np.r_[1e-3, 0, 0, 0, 0, 0], 0, 6), known).passed
-    assert not find_shift(changed(views, list(range(6)), joints_rad=lambda _: None), known).arm_known
+    assert _with_joints(views, known, np.degrees).statistic == pytest.approx(still.statistic, rel=1e-6)
+    assert not _with_joints(views, known, lambda q: 1.1 * q).arm_known, "not this arm's"
+
+
+def _with_joints(views: ViewSet, known: KnownCell, told: Callable[[Array], Array | None]) -> DriftCheck:
+    every = list(range(len(views)))
+    return find_shift(changed(views, every, joints_rad=lambda view: told(view.joints_rad)), known)
+
+
+def test_without_joints_the_installed_camera_is_checked() -> None:
+    """It fits flanges as they are told; the posterior's belongs to corrected ones."""
+    cell = arm_cell("seven joints", "eye-to-hand", 0.3, 900)
+    solution = solve_views(cell.views, QUICK)
+    assert solution.posterior is not None and solution.arm is not None
+    installed = solution.arm.installed
+    assert installed is not None
+    known = KnownCell.of(solution.posterior, solution.camera)
+    known = replace(known, installed=(installed.X, installed.covariance))
+    same = cell.views.select(list(range(0, 25, 2)))
+    told = _with_joints(same, known, lambda _: None)
+    corrected = _with_joints(same, replace(known, installed=None), lambda _: None)
+    assert not told.arm_known and told.statistic < corrected.statistic
 
 
 @MOUNTS
@@ -151,6 +173,8 @@ def test_the_file_gives_back_what_the_fit_left_known(solved_real: SolvedRecordin
     before, after = known_cell(solved_real.calibration), known_cell(read_calibration(path))
     np.testing.assert_array_equal(after.covariance, before.covariance)
     np.testing.assert_array_equal(after.mean.X, before.mean.X)
+    assert after.installed is not None
+    np.testing.assert_array_equal(after.installed[0], solved_real.calibration.transform.matrix)
     views = solved_real.views
     assert (
         check_drift(views, read_calibration(path)).statistic

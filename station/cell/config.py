@@ -7,7 +7,6 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
-from calibrate.files.validity import LONGEST_AGE_DAYS
 from recordings.files import MAIN_CAMERA
 from recordings.schema import stillness
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Matrix4, Mount, Vector6
@@ -195,7 +194,7 @@ class CaptureConfig(Section, frozen=True):
 class ValidityConfig(Section, frozen=True):
     """Age from which an installed calibration is in doubt."""
 
-    max_age_days: Annotated[float, msgspec.Meta(gt=0, le=LONGEST_AGE_DAYS)] | None = None
+    max_age_days: Annotated[float, msgspec.Meta(gt=0, le=36_500)] | None = None
     """Largest age of the last proof (calibration or passed drift check); None: no limit."""
 
 

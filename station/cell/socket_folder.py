@@ -156,6 +156,14 @@ def peer_of(link: socket.socket) -> tuple[int, int, int]:
     return pid, uid, gid
 
 
+def way_to_end(link: socket.socket) -> str:
+    """Say how this user ends the daemon at the other end of a Unix socket; empty: it is another's."""
+    pid, uid, _ = peer_of(link)
+    if not pid or uid != os.getuid():
+        return ""
+    return f": `kill {pid}`, which stops the arm first and finishes the recording"
+
+
 def user_name(uid: int) -> str:
     """Return a user's name, or 'uid 1003' when it is unknown."""
     import pwd

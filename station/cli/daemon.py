@@ -15,7 +15,7 @@ from socket import socket as connection
 
 from recordings.files import LOG_LIMIT_BYTES, open_regular, read_file, state_root
 from station.cell.errors import StationError
-from station.cell.socket_folder import default_socket, peer_of
+from station.cell.socket_folder import default_socket, way_to_end
 from station.cli.console import Socket
 from station.protocol.client import DaemonGoneError, ask
 from station.protocol.verbs import GetPlan
@@ -107,10 +107,16 @@ def tell_what_goes_on(socket: Path) -> None:
             link.connect(str(socket))
         except OSError:
             return
-        pid, user, _ = peer_of(link)
-    own = pid and user == os.getuid()
-    ends = f"; `kill {pid}` ends it: the arm stops first, and the recording is finished" if own else ""
-    print(f"The station goes on without this screen. `station` opens it again{ends}.")
+        how = way_to_end(link)
+    end = how and f" End it{how}."
+    print(f"The station goes on without this screen. `station` opens it again.{end}")
+
+
+def require_none(path: Path) -> None:
+    """Raise StationError (`already-served`) where a daemon serves."""
+    with connection(AF_UNIX) as link:
+        if link.connect_ex(str(path)) == 0:
+            raise StationError("already-served", path=path, how=way_to_end(link))
 
 
 def answers(socket: Path) -> bool:

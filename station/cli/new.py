@@ -18,7 +18,7 @@ from station.cell.config import CameraConfig, RobotConfig
 from station.cell.errors import RobotError, StationError
 from station.cell.socket_folder import default_socket
 from station.cli.console import err
-from station.cli.daemon import answers, ensure_daemon, own_daemon, tell_what_goes_on, user_config
+from station.cli.daemon import ensure_daemon, own_daemon, require_none, tell_what_goes_on, user_config
 from station.devices.aravis import AravisCamera
 from station.devices.discovery import discover, discover_usb
 from station.devices.ur_dashboard import STOP
@@ -143,8 +143,7 @@ def _serve(config: Path) -> None:
     from station.tui.app import run
 
     socket = default_socket()
-    if answers(socket):
-        raise StationError("already-served", path=socket)
+    require_none(socket)
     run(ensure_daemon(socket, config))
     tell_what_goes_on(socket)
 

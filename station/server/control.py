@@ -18,7 +18,7 @@ import msgspec
 
 from recordings.errors import CodedError
 from station.cell.errors import RefusedError, StationError
-from station.cell.socket_folder import bind, make_folder, peer_of
+from station.cell.socket_folder import bind, make_folder, peer_of, way_to_end
 from station.cell.status import StationStatus, changed_sections
 from station.protocol.messages import (
     CLIENT_LIMIT,
@@ -270,4 +270,4 @@ def _remove_stale(path: Path) -> None:
             return
         except OSError as error:
             raise StationError("socket", path=path, reason=str(error)) from None
-    raise StationError("already-served", path=path)
+        raise StationError("already-served", path=path, how=way_to_end(probe))

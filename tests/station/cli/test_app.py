@@ -181,4 +181,4 @@ def test_closing_the_screen_tells_what_goes_on(tmp_path: Path, capsys: pytest.Ca
         daemon.bind(str(path))
         daemon.listen()
         tell_what_goes_on(path)
-    assert f"`kill {os.getpid()}` ends it" in capsys.readouterr().out
+    assert f"`kill {os.getpid()}`" in capsys.readouterr().out

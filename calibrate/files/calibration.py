@@ -139,7 +139,7 @@ class SessionReading(msgspec.Struct, frozen=True):
 
 
 class ArmErrorValue(msgspec.Struct, frozen=True):
-    """One error of the arm's kinematic table, true minus nominal, metres or radians."""
+    """Error of the arm: of links true minus nominal, of a bracket nominal minus true; metres or radians."""
 
     parameter: str
     value: float

@@ -17,7 +17,7 @@ from calibrate.kinematics import MODELS, RobotModel, inverse_many, with_near_axe
 from calibrate.views import ViewSet
 
 FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
-"""Names of a bracket's compliance, radians: turn about `row` for gravity along `column` of the flange."""
+"""Names of a bracket's compliance, radians: minus turn about `row` for gravity along `column` in flange."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +83,10 @@ def gravity_in_flange(flange: Array) -> Array:
 def flex_motion(flange: Array, held: Array, level: Array | None = None) -> Array:
     """Compute the motion (n, 6, 9) of the flange, in base, by each entry of a bracket's compliance (3, 3).
 
-    The bracket carries the camera (eye-in-hand) or the board at `held` (4, 4) in the flange. It bends by the
-    compliance times the direction of gravity in the flange. The bend at gravity `level` (3,), None: the mean
-    of the views, is subtracted: it belongs to X or Y.
+    The bracket carries the camera (eye-in-hand) or the board at `held` (4, 4) in the flange. It turns that
+    about its own origin, by minus the compliance times the direction of gravity in the flange. A beam also
+    shifts its end; that is left to the noise. The bend at gravity `level` (3,), None: the mean of the views,
+    is subtracted: it belongs to X or Y.
     """
     R, gravity = flange[:, :3, :3], gravity_in_flange(flange)
     gravity = gravity - (gravity.mean(axis=0) if level is None else level)

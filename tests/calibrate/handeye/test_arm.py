@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibrate.geometry import Array
+from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye import arm_fit
 from calibrate.handeye import fit as fit_module
-from calibrate.handeye.arm import arm_postures
+from calibrate.handeye.arm import arm_postures, flex_motion, gravity_in_flange
 from calibrate.handeye.estimate import MeanParts
 from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import solve_views
 from calibrate.views import ViewSet
+from recordings.schema.messages import Mount
 from tests.calibrate.cells import MOUNTS, QUICK, changed, error_mm_deg, inside
 from tests.calibrate.chains import arm_cell
 from tests.calibrate.worn_cell import worn_cell
@@ -30,6 +31,16 @@ def worn_views(size_mm: float) -> ViewSet:
 
 def without_joints(views: ViewSet) -> ViewSet:
     return changed(views, list(range(len(views))), joints_rad=lambda _: None)
+
+
+@MOUNTS
+def test_a_bracket_turns_what_it_carries_by_minus_its_compliance(mount: Mount) -> None:
+    cell, compliance = arm_cell("ur", mount, 0.0, 1), 1e-5 * np.random.default_rng(1).normal(size=(3, 3))
+    F, held = cell.views.base_from_flange, cell.X if mount == "eye-in-hand" else cell.Y
+    turn = rotation_exp(gravity_in_flange(F) @ compliance.T)
+    bent = pose(turn @ held[:3, :3], np.broadcast_to(held[:3, 3], (len(F), 3)))
+    found = flex_motion(F, held, np.zeros(3)) @ -compliance.ravel()
+    np.testing.assert_allclose(found, difference(F @ bent @ inverse(held), F), atol=1e-9)
 
 
 def test_table_errors_are_found_and_coverage_comes_back():

@@ -153,10 +153,6 @@ class CellSetup:
         same = before is not None and msgspec.structs.replace(before, **sizes) == board
         self._found(same, board=board)
 
-    async def stop(self) -> None:
-        if self.arm is not None:
-            await self.arm.stop()
-
     async def close(self) -> None:
         for device in (self.camera, self.arm):
             if device is not None:

@@ -196,11 +196,12 @@ class NewCell(LivePageApp[Ending]):
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
-        if self.setup.draft.posted:
-            self.notify("The station cannot stop this arm: use STOP on its own pendant.", severity="error")
+        if self.setup.arm is None:
+            words = "STOP reached nobody: no controller is connected. Press STOP on the arm's own pendant."
+            self.notify(words, severity="error")
             return
         try:
-            await self.setup.stop()
+            await self.setup.arm.stop()
         except StationError as problem:
             self.notify(f"STOP was not sent: {problem} Press the EMERGENCY STOP.", severity="error")
             return

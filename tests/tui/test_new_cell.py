@@ -76,6 +76,8 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path, monkeypatch: p
         app = NewCell(SimulatedHardware(truth, controller.host), tmp_path, tmp_path / "station.yaml")
         async with app.run_test(size=(120, 36)) as pilot:
             person = Operator(pilot, app, controller)
+            await pilot.press("f12")
+            await until(pilot, lambda: [said.severity for said in app._notifications] == ["error"])
             await person.type(controller.host)
             await person.press("enter")
             await person.until_step(CellStep.CAMERA)

@@ -198,8 +198,10 @@ class Posterior(msgspec.Struct, frozen=True, omit_defaults=True):
     """None: the arm's errors are not known, or inside X's covariance."""
     stated_arm_error: tuple[tuple[float, ...], ...] | None = None
     """Covariance (6, 6) of X by the stated error of the robot: one in the fit, another in every check."""
-    gravity: tuple[float, ...] | None = None
+    level: tuple[float, ...] | None = None
     """Mean direction of gravity in the flange, to which X belongs; None: no bracket's bend in `errors`."""
+    gravity: tuple[float, ...] | None = None
+    """`level` in earlier files, where the bracket's `errors` have the other sign."""
 
 
 SHAPE = ("scale", "anisotropy", "bend xx", "bend yy", "bend xy")

@@ -139,7 +139,7 @@ class SessionReading(msgspec.Struct, frozen=True):
 
 
 class ArmErrorValue(msgspec.Struct, frozen=True):
-    """Error of the arm: of links true minus nominal, of a bracket nominal minus true; metres or radians."""
+    """One error of the arm's links or of a bracket, true minus nominal, metres or radians."""
 
     parameter: str
     value: float

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.chain import Chain, LearnedChain, chain_of, learn_chain, read_otherwise, wrong_row
-from calibrate.geometry import Array, difference, skew
+from calibrate.geometry import Array, difference
 from calibrate.kinematics import MODELS, RobotModel, inverse_many, with_near_axes
 from calibrate.views import ViewSet
 
 FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
-"""Names of a bracket's compliance, radians: minus turn about `row` for gravity along `column` in flange."""
+"""Names of a bracket's compliance, radians: turn about `row` for gravity along `column` of the flange."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,18 +80,17 @@ def gravity_in_flange(flange: Array) -> Array:
     return np.asarray(-flange[:, 2, :3])
 
 
-def flex_motion(flange: Array, held: Array, level: Array | None = None) -> Array:
+def flex_motion(flange: Array, level: Array | None = None) -> Array:
     """Compute the motion (n, 6, 9) of the flange, in base, by each entry of a bracket's compliance (3, 3).
 
-    The bracket carries the camera (eye-in-hand) or the board at `held` (4, 4) in the flange. It turns that
-    about its own origin, by minus the compliance times the direction of gravity in the flange. A beam also
-    shifts its end; that is left to the noise. The bend at gravity `level` (3,), None: the mean of the views,
-    is subtracted: it belongs to X or Y.
+    A bracket of camera (eye-in-hand) or board bends near the flange: it turns about the flange's origin by
+    the compliance times the direction of gravity in the flange. The bend at gravity `level` (3,), None: the
+    mean of the views, is subtracted: it belongs to X or Y.
     """
     R, gravity = flange[:, :3, :3], gravity_in_flange(flange)
     gravity = gravity - (gravity.mean(axis=0) if level is None else level)
-    turn = np.einsum("rk,nc->nkrc", np.eye(3), gravity).reshape(len(R), 3, 9)
-    return np.concatenate([-R @ skew(held[:3, 3]) @ turn, -R @ turn], axis=1)
+    turn = R @ np.einsum("rk,nc->nkrc", np.eye(3), gravity).reshape(len(R), 3, 9)
+    return np.concatenate([np.zeros_like(turn), turn], axis=1)
 
 
 def smooth_motion(flange: Array) -> Array:

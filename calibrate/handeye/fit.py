@@ -56,8 +56,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
     log_bayes, plain, failure, unknown = None, found, "", np.zeros((6, 6))
     arm, joints_note = arm_postures(views) if model_arm else (None, "")
     if model_arm and len(views) >= FEWEST_FOR_ARM_ERRORS:
-        held = found.state.X if views.mount == "eye-in-hand" else found.state.Y  # camera or board
-        flex = flex_motion(views.base_from_flange, held)
+        flex = flex_motion(views.base_from_flange)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
         STAGES.info("3 of 4: errors of the arm")
         modelled = replace(observed, by_arm_errors=np.concatenate([links, flex], axis=2))

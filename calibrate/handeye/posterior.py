@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.chain import Chain, LearnedChain, readings
 from calibrate.geometry import Array, difference
-from calibrate.handeye.arm import flex_motion, gravity_in_flange, recorded_joints
+from calibrate.handeye.arm import FLEX, flex_motion, gravity_in_flange, recorded_joints
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.estimate import CellFit
@@ -54,7 +54,7 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
         board_extent_m=_rows(fit.observed.extent),
         arm=None if chain is None else chain.plain,
         stated_arm_error=_rows(stated_arm_error) if stated_arm_error.any() else None,
-        gravity=tuple(level.tolist()) if len(state.arm_errors) else None,
+        level=tuple(level.tolist()) if len(state.arm_errors) else None,
     )
 
 
@@ -94,7 +94,11 @@ class KnownCell:
         covariance = np.zeros((size, size))
         covariance[np.tril_indices(size)] = posterior.covariance_lower
         covariance += np.tril(covariance, -1).T
-        arm = posterior.arm
+        if posterior.gravity is not None:
+            errors[-len(FLEX) :] *= -1
+            covariance[-len(FLEX) :] *= -1
+            covariance[:, -len(FLEX) :] *= -1
+        arm, gravity = posterior.arm, posterior.level or posterior.gravity
         tau, lambda_, sigma = posterior.corner_noise_px
         return cls(
             CellState(
@@ -110,7 +114,7 @@ class KnownCell:
             posterior.freedom,
             np.array(posterior.board_extent_m),
             None if arm is None else Chain.of(arm),
-            None if posterior.gravity is None else np.array(posterior.gravity),
+            None if gravity is None else np.array(gravity),
             np.zeros((6, 6)) if posterior.stated_arm_error is None else np.array(posterior.stated_arm_error),
         )
 
@@ -162,9 +166,8 @@ class KnownCell:
         if self.chain is not None and joints is not None:
             columns = self.chain.by_links(joints)
         if self.gravity is not None:
-            flange = views.base_from_flange
-            held = self.mean.X if views.mount == "eye-in-hand" else self.start(views).Y
-            columns = np.concatenate([columns, flex_motion(flange, held, self.gravity)], axis=2)
+            flex = flex_motion(views.base_from_flange, self.gravity)
+            columns = np.concatenate([columns, flex], axis=2)
         return replace(observed, by_arm_errors=columns)
 
     def start(self, views: ViewSet) -> CellState:

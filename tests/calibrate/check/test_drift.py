@@ -182,6 +182,19 @@ def test_the_file_gives_back_what_the_fit_left_known(solved_real: SolvedRecordin
     )
 
 
+def test_an_earlier_file_has_the_bends_of_a_bracket_reversed(solved_real: SolvedRecording) -> None:
+    posterior, camera = solved_real.calibration.posterior, solved_real.calibration.intrinsics.model
+    assert posterior is not None and posterior.level is not None
+    earlier = msgspec.structs.replace(posterior, level=None, gravity=posterior.level)
+    now, then = KnownCell.of(posterior, camera), KnownCell.of(earlier, camera)
+    sign = np.r_[np.ones(len(now.covariance) - 9), np.full(9, -1.0)]
+    np.testing.assert_array_equal(then.covariance, now.covariance * np.outer(sign, sign))
+    np.testing.assert_array_equal(
+        then.mean.arm_errors, sign[-len(now.mean.arm_errors) :] * now.mean.arm_errors
+    )
+    assert then.gravity is not None and tuple(then.gravity) == posterior.level
+
+
 def test_another_board_is_not_expected_to_have_this_ones_shape() -> None:
     known, other = installed(), installed().with_board(BoardTolerance(0.002, 0.003))
     assert np.sqrt(np.diag(other.covariance)[15:]) == pytest.approx([0.002, 0.002, 0.003, 0.003, 0.003])

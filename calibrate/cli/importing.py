@@ -35,7 +35,7 @@ def import_command(
     source: Annotated[
         Path,
         typer.Argument(
-            help="A folder with images and robot poses, a ROS 2 bag, or an MCAP file",
+            help="A folder with images and robot poses, a file with pairs of poses, or a ROS bag",
             show_default=False,
         ),
     ],
@@ -94,10 +94,11 @@ def import_command(
     with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
         if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
-        elif source.is_dir() and not any(path.suffix in BAGS for path in source.iterdir()):
-            told = read_dataset(dataset)[0] if dataset else _told(source, output)
+        elif source.exists() and not any(path.suffix in BAGS for path in [source, *source.glob("*")]):
+            lies = look(source, poses)
+            told = read_dataset(dataset)[0] if dataset else _told(lies.root, output)
             given = Given(convention, mount, None if board is None else typed_board(board))
-            done = _import_found(look(source, poses), target, told, given, progress)
+            done = _import_found(lies, target, told, given, progress)
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)

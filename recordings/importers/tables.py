@@ -113,20 +113,24 @@ class _Row:
 
 
 def look(source: Path, poses: Path | None = None) -> Lies:
-    """Read what lies in `source`; `poses` tells the robot's: a file, a folder or the end of their names."""
-    file = poses if poses is None or poses.exists() else source / poses
-    found, words = Lies(source, told=None if poses is None else []), ["/".join(source.resolve().parts[-3:])]
+    """Read what lies in a folder, or one file.
+
+    `poses` tells the robot's: a file, a folder or the end of their names.
+    """
+    root = source if source.is_dir() else source.parent
+    file = poses if poses is None or poses.exists() else root / poses
+    found, words = Lies(root, told=None if poses is None else []), ["/".join(source.resolve().parts[-3:])]
     rows = defaultdict[tuple[str, ...], list[_Row]](list)
     files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
-    for path in files if file is None or file.is_relative_to(source) else [*files, file]:
+    for path in files if file is None or file.is_relative_to(root) else [*files, file]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
-            alike = str(path.relative_to(source).parent / _pattern(path.name))
+            alike = str(path.relative_to(root).parent / _pattern(path.name))
             found.images.setdefault(alike, []).append(path)
             continue
         tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
         if tree is None:
             continue
-        name = str(path.relative_to(source)) if path.is_relative_to(source) else path.name
+        name = str(path.relative_to(root)) if path.is_relative_to(root) else path.name
         words.append(name)
         told = defaultdict[tuple[str, ...], list[_Row]](list)
         for node in _nodes(tree, (), ""):
@@ -191,6 +195,8 @@ def _two_by_two(rows: list[_Row]) -> dict[str, list[_Row]]:
 
 def _files(source: Path) -> Iterator[Path]:
     """All files, also below folders that are links; each folder once."""
+    if source.is_file():
+        yield source
     been = {os.path.realpath(source)}
     for folder, below, names in os.walk(source, followlinks=True):
         below[:] = sorted(name for name in below if os.path.realpath(Path(folder, name)) not in been)

@@ -457,8 +457,7 @@ def test_one_of_two_tables_is_named_the_robots_and_a_reading_told_whole_is_taken
 
 @pytest.mark.skipif(not MOVEIT.is_file(), reason="the pose pairs of MoveIt's own test are not here")
 def test_moveits_own_pairs_give_what_its_test_expects(tmp_path: Path) -> None:
-    (tmp_path / "pairs.csv").write_bytes(MOVEIT.read_bytes())
     rec = tmp_path / "pairs.mcap"
-    assert call(main, "import", tmp_path, "-o", rec, "--mount", "eye-to-hand").returncode == 0
+    assert call(main, "import", MOVEIT, "-o", rec, "--mount", "eye-to-hand").returncode == 0
     at = solve_recording(rec).solution.matrix[:3, 3]
     np.testing.assert_allclose(at, [0.659, -0.249, 0.830], rtol=0.01)

@@ -91,5 +91,6 @@ class DriftCheckJson(msgspec.Struct, frozen=True):
     views_needed: int | None
     disagreement: float
     views: int
+    arm_known: bool
     trend: str
     validity: Validity | None

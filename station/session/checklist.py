@@ -48,7 +48,7 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
     identity, condition = robot.identity, robot.condition(state)
     if (mover := context.cell.mover) is None:
         return [
-            Check("robot", "ok", f"{identity.model} {identity.serial}: its pose is posted"),
+            Check("robot", "ok", f"{identity.model} {identity.serial}".rstrip() + ": its pose is posted"),
             Check("control", "skipped", "a person moves this arm: STOP is on its own pendant"),
         ]
     checks = [

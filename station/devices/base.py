@@ -127,6 +127,9 @@ class Mover(Protocol):
     def remote(self) -> bool | None:
         """Whether remote control is on; None where there is no such switch or it is not known."""
 
+    async def may_start(self) -> None:
+        """Check that control could be started now: nobody shall approve in vain. RobotError says why not."""
+
     async def start_control(self) -> None:
         """Start the control process. Call only after a motion approval. RobotError when refused."""
 

@@ -184,6 +184,9 @@ class PlaybackRobot:
     def check(self) -> RobotState | None:
         return self.latest()
 
+    async def may_start(self) -> None:
+        return
+
     async def start_control(self) -> None:
         self.control = True
 

@@ -99,7 +99,7 @@ class UrRobot(UrLink):
         self._stop_reason, self._ended_by = "", None
         await self.idle()  # a child that is still ending keeps the registers
         await ready(self)
-        await self._may_start()
+        await self.may_start()
         if why := self._why_stopped():
             raise _stopped(f" before control started{why}")
         child = self._child = ControlChild.spawn(self.config.host, self._log_path, self.control_path)
@@ -128,7 +128,7 @@ class UrRobot(UrLink):
         except RobotError as error:
             raise await cause_of_end(self, child, self._program_trouble(self.latest()) or error) from None
 
-    async def _may_start(self) -> None:
+    async def may_start(self) -> None:
         """Check that control can be started without replacing a program; else RobotError with remedy."""
         # e-Series controllers keep refusing commands on a connection that was opened in local mode.
         dashboard = await self.renew_dashboard()

@@ -179,6 +179,7 @@ class Session:
             await look_back(context)
             motion = session_motion(context, purpose)
         preview = await previewed(context, motion)
+        await context.cell.require_mover().may_start()
         self.permit(verbs.Prepare, client_id)
         if self.approvals.voids != voids:
             raise RefusedError("changed")

@@ -95,13 +95,13 @@ async def test_stop_before_the_control_process_exists(
     cell: MakeCell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     c = await cell(control=False)
-    checks = c.robot._may_start
+    checks = c.robot.may_start
 
     async def stop_comes_now() -> None:
         await checks()
         await c.robot.stop("changed my mind")
 
-    monkeypatch.setattr(c.robot, "_may_start", stop_comes_now)
+    monkeypatch.setattr(c.robot, "may_start", stop_comes_now)
     with raises("stopped"):
         await c.robot.start_control()
     assert c.control_pid is None and await c.asked("upload") == 0

@@ -125,6 +125,9 @@ class ArmInMemory:
             raise self.trouble
         return self.news()
 
+    async def may_start(self) -> None:
+        return
+
     async def start_control(self) -> None:
         self.log.append("start control")
         if self.refuse_control is not None:

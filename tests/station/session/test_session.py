@@ -7,6 +7,7 @@ import math
 import threading
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
 import msgspec
 import numpy as np
@@ -202,6 +203,13 @@ async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_pl
     with raises("plan", LimitError):
         await rig.session.prepare(1, Purpose.RUN)
     assert "move" not in rig.arm.log
+
+
+async def test_nobody_approves_what_the_arm_will_refuse(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig.arm, "may_start", AsyncMock(side_effect=RobotError("local-control")))
+    with raises("local-control"):
+        await rig.session.prepare(1, Purpose.RUN)
+    assert rig.session.store.status.go is None
 
 
 async def test_a_refused_control_leaves_everything_as_it_was(rig: Rig, tmp_path: Path) -> None:

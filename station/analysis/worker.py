@@ -119,7 +119,6 @@ def sight(
         reason=found.reason,
         corners=found.corners,
         expected=found.expected,
-        sharpness=round(float(found.sharpness), 4),
         saturated=round(float(found.saturated), 4),
         coverage=round(float(found.coverage), 4),
         tilt_rad=tilt_rad,

@@ -159,9 +159,8 @@ def peer_of(link: socket.socket) -> tuple[int, int, int]:
 def way_to_end(link: socket.socket) -> str:
     """Say how this user ends the daemon at the other end of a Unix socket; empty: it is another's."""
     pid, uid, _ = peer_of(link)
-    if not pid or uid != os.getuid():
-        return ""
-    return f": `kill {pid}`, which stops the arm first and finishes the recording"
+    own = pid and uid == os.getuid()
+    return f": `kill {pid}`, which stops the arm first and finishes the recording" if own else ""
 
 
 def user_name(uid: int) -> str:

@@ -163,7 +163,6 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     reason: str = ""
     corners: int = 0
     expected: int = 0
-    sharpness: float = 0.0
     saturated: float = 0.0
     """Share of saturated pixels, 0…1"""
     coverage: float = 0.0

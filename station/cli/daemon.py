@@ -108,8 +108,7 @@ def tell_what_goes_on(socket: Path) -> None:
         except OSError:
             return
         how = way_to_end(link)
-    end = how and f" End it{how}."
-    print(f"The station goes on without this screen. `station` opens it again.{end}")
+    print(f"The station goes on without this screen. `station` opens it again.{how and f' End it{how}.'}")
 
 
 def require_none(path: Path) -> None:

@@ -133,7 +133,7 @@ def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool
         return "not-found", f"no {describe_board(spec)} found"
     text = f"board {spec.columns}×{spec.rows} expected, {seen[0]}×{seen[1]} seen (inner corners)"
     if seen == (spec.columns - 1, spec.rows - 1):
-        return "squares-counted", f"{text}: squares were counted"
+        return "squares-counted", f"{text}: squares were counted, or a row and a column are hidden"
     return "other-board", f"{text}: partly hidden, or another board"
 
 

@@ -172,6 +172,8 @@ def test_another_device_than_the_calibrated_one_is_a_doubt(root: Path, kind: str
 
 def test_the_cells_own_rule_puts_an_old_proof_in_doubt(make_file: MakeFile, tmp_path: Path) -> None:
     root = tmp_path / "s"
+    with raises("not-positive"):
+        install(make_file(), root, max_age_days=float("nan"))
     install(make_file(), root, max_age_days=30.0)
     now = datetime.now(UTC)
     proven = Validity(1, V, "", ValidityReason("installed"), verified=now.isoformat(), max_age_days=30.0)
@@ -198,7 +200,7 @@ def test_a_state_may_be_given_by_its_name_and_no_other_one(root: Path) -> None:
     proven = load_installed(root).validity.verified
     assert set_validity(root, D, MOVED).verified == proven, "a doubt proves nothing"
     assert set_validity(root, "valid", MOVED).state is V  # type: ignore[arg-type]
-    assert load_installed(root).validity.verified != installed_calibration(root).created
+    assert load_installed(root).validity.verified != proven
     with raises("choice", UsageError, given="validd"):
         set_validity(root, "validd", MOVED)  # type: ignore[arg-type]
 

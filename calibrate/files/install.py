@@ -12,7 +12,7 @@ from typing import Literal, get_args
 import msgspec
 import numpy as np
 
-from calibrate.errors import GateFailedError, InstallError, require_choice
+from calibrate.errors import GateFailedError, InstallError, require_choice, require_positive
 from calibrate.files.calibration import Calibration, Override, read_calibration
 from calibrate.files.folders import (
     calibrations_folder,
@@ -94,6 +94,7 @@ def install(
     Raises InstallError (also as exit code 4 for a gate) or CalibrationFileError.
     """
     require_choice("cell", cell, get_args(Cell))
+    require_positive(max_age_days=max_age_days or None)  # 0: no limit
     calibration = read_calibration(path)
     camera = camera or calibration.camera_name
     folder = calibrations_folder(root, camera)

@@ -68,8 +68,7 @@ def update_robot(scales: Scales, chances: Array, z: Array, P: Array) -> Scales:
     up = found.reshape(2, 3).sum(axis=1) + 1 / square
     down = predicted.reshape(2, 3).sum(axis=1) + 2 / (square + _USUAL_ROBOT**2)
     total = chances.sum(axis=0) + SHARE_COUNTS
-    robot = np.sqrt(square * up / down).clip(LEAST_ROBOT)
-    return replace(scales, robot=robot, shares=total / total.sum())
+    return replace(scales, robot=np.sqrt(square * up / down).clip(LEAST_ROBOT), shares=total / total.sum())
 
 
 def update_corners(

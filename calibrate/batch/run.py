@@ -14,7 +14,6 @@ import cv2
 import msgspec
 
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
-from calibrate.bounds import Limits, bounded
 from calibrate.document import software_versions
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration, write_output
@@ -22,6 +21,7 @@ from calibrate.files.lines import append_line, read_lines
 from calibrate.files.proof import content_sha256
 from calibrate.job import JobOptions, SolvedRecording
 from calibrate.pipeline import solve_recording
+from calibrate.resource_limits import Limits, bounded
 from recordings.errors import RecordingError
 from recordings.plain_text import plain_text
 
@@ -120,7 +120,7 @@ def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tup
     recording, key = task
     cv2.setNumThreads(1)
     try:
-        with bounded(limits.time_s, limits.memory_mib):
+        with bounded(limits):
             job = solve_recording(Path(recording), replace(options, threads=1))
         content = encode_calibration(job.calibration)
     except (CalibrationError, RecordingError) as problem:

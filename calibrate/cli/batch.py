@@ -15,13 +15,13 @@ import typer
 from calibrate.batch.cluster import cluster_workers
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import pool
-from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.files import read_limits
 from calibrate.cli.output import AsJson, err, out
 from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit
 from calibrate.errors import UsageError
 from calibrate.job import JobOptions
 from calibrate.recorded_views import Progress as LoadProgress
+from calibrate.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from recordings.cli.console import progress_bar
 
 DONE_WITH_LOSS = 3

@@ -13,7 +13,6 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.cli.contracts import CompareJson, SolveJson
 from calibrate.cli.files import read_board, read_camera, read_limits
 from calibrate.cli.output import (
@@ -44,6 +43,7 @@ from calibrate.handeye.solution import camera_frames
 from calibrate.job import JobOptions, SolvedRecording
 from calibrate.lens.intrinsics import LensModel
 from calibrate.pipeline import prepare_views, solve_recording, solver_options
+from calibrate.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits, bounded
 from calibrate.results import PeerResult
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
@@ -114,7 +114,7 @@ def solve(
         check_target(report, "report")
         if os.path.realpath(report) == os.path.realpath(target):
             raise UsageError("target-exists", path=target, by="both calibration and report")
-    with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
+    with bounded(Limits(time_limit_s, memory_limit_mib)), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)
     if report is not None:

@@ -15,9 +15,9 @@ import pytest
 
 from calibrate.batch.run import RESULTS, BatchResult, batch_key, run_batch
 from calibrate.batch.workers import Lost, R, T, pool
-from calibrate.bounds import Limits
 from calibrate.files.lines import read_lines
 from calibrate.job import JobOptions
+from calibrate.resource_limits import Limits
 from tests.patience import PATIENCE_S, wait_until
 
 

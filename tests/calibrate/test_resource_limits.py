@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.bounds import SolveLimitError, bounded
 from calibrate.errors import CalibrationError
+from calibrate.resource_limits import Limits, SolveLimitError, bounded
 from tests.codes import raises
 from tests.patience import PATIENCE_S
 
@@ -24,7 +24,7 @@ PROGRAM = (sys.executable, "-m", "calibrate.cli", "solve")
 
 
 def test_what_takes_too_long_is_ended_with_a_name() -> None:
-    with raises("time-limit", SolveLimitError, limit_s=0.1), bounded(0.1, 0):
+    with raises("time-limit", SolveLimitError, limit_s=0.1), bounded(Limits(0.1, 0)):
         _work(PATIENCE_S)
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
@@ -37,7 +37,7 @@ def _work(duration_s: float) -> None:
 
 
 def test_a_handler_that_swallows_the_first_alarm_meets_the_next() -> None:
-    with pytest.raises(SolveLimitError), bounded(0.05, 0):
+    with pytest.raises(SolveLimitError), bounded(Limits(0.05, 0)):
         with suppress(CalibrationError):
             _work(PATIENCE_S)
         _work(PATIENCE_S)
@@ -45,7 +45,7 @@ def test_a_handler_that_swallows_the_first_alarm_meets_the_next() -> None:
 
 def test_a_handler_that_fails_at_the_alarm_does_not_hide_it() -> None:
     """As `Thread.start` does, in whose midst an alarm may come."""
-    with pytest.raises(SolveLimitError), bounded(0.05, 0):
+    with pytest.raises(SolveLimitError), bounded(Limits(0.05, 0)):
         try:
             _work(PATIENCE_S)
         except CalibrationError:
@@ -63,7 +63,7 @@ def test_an_alarm_while_the_block_ends_leaves_nothing_behind(monkeypatch: pytest
 
     with monkeypatch.context() as patched:
         patched.setattr(signal, "setitimer", alarm_first)
-        with bounded(60, 0):
+        with bounded(Limits(60, 0)):
             (own,) = _timers() - others
     assert signal.getsignal(signal.SIGALRM) == before
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
@@ -79,7 +79,7 @@ def _timers() -> set[threading.Thread]:
 @pytest.mark.parametrize("eater", ["numpy", "opencv"])
 def test_what_needs_too_much_memory_is_ended_with_a_name(eater: str) -> None:
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    with raises("memory-limit", SolveLimitError, limit_mib=6000), bounded(0, 6000):
+    with raises("memory-limit", SolveLimitError, limit_mib=6000), bounded(Limits(0, 6000)):
         if eater == "numpy":
             np.ones((1000, 1000, 1000))
         else:
@@ -90,7 +90,7 @@ def test_what_needs_too_much_memory_is_ended_with_a_name(eater: str) -> None:
 def test_other_errors_pass_unchanged() -> None:
     with pytest.raises(cv2.error), bounded():
         cv2.resize(np.zeros((0, 0), np.uint8), (1, 1))
-    with bounded(60, 4096):
+    with bounded(Limits(60, 4096)):
         assert signal.getitimer(signal.ITIMER_REAL)[0] > 0
 
 

@@ -38,17 +38,15 @@ class Limits:
     memory_mib: int = MEMORY_LIMIT_MIB
 
 
-def bounded(
-    time_limit_s: float = TIME_LIMIT_S, memory_limit_mib: int = MEMORY_LIMIT_MIB
-) -> AbstractContextManager[None]:
-    """Raise SolveLimitError once the block has taken so long, or so much memory; 0 = no limit.
+def bounded(limits: Limits | None = None) -> AbstractContextManager[None]:
+    """Raise SolveLimitError once the block has taken so long, or so much memory.
 
     Memory is that of this whole process (its data, not the files it maps). Outside the main thread, where no
     signal can be had and others share the memory, nothing is limited.
     """
     if threading.current_thread() is not threading.main_thread():
         return nullcontext()
-    return _Bounded(Limits(time_limit_s, memory_limit_mib))
+    return _Bounded(limits or Limits())
 
 
 class _Bounded(AbstractContextManager[None]):

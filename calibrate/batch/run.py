@@ -17,8 +17,8 @@ from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.document import software_versions
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration, write_output
+from calibrate.files.integrity import content_sha256
 from calibrate.files.lines import append_line, read_lines
-from calibrate.files.proof import content_sha256
 from calibrate.job import JobOptions, SolvedRecording
 from calibrate.pipeline import solve_recording
 from calibrate.resource_limits import Limits, bounded

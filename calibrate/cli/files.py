@@ -11,7 +11,7 @@ import numpy as np
 from calibrate.boards.model import check_board
 from calibrate.errors import UsageError
 from calibrate.files.calibration import read_calibration
-from calibrate.files.proof import FORMATS
+from calibrate.files.integrity import FORMATS
 from calibrate.gates import GateLimits
 from calibrate.lens.intrinsics import LensModel
 from calibrate.projection import camera_matrix, distortion

@@ -20,7 +20,7 @@ from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.exports.drivers import fixed_frames
 from calibrate.files.folders import cameras, current_version, readable_folder, validity_of
 from calibrate.files.formatting import override_text, pose_text, summary, verdict_text
-from calibrate.files.proof import read_bounded
+from calibrate.files.integrity import read_bounded
 from calibrate.files.validity import LONGEST_AGE_DAYS, Validity, ValidityState, validity_text
 from calibrate.files.versions import InstalledVersion, installed_versions
 from recordings.files import MAIN_CAMERA, state_root

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from calibrate.chain import Chain, chain_of
 from calibrate.errors import CalibrationFileError
-from calibrate.files.proof import check_result, content_sha256, proven_plain, read_bounded
+from calibrate.files.integrity import check_result, content_sha256, read_bounded, verified_plain
 from calibrate.files.touch import Touch
 from calibrate.geometry import Array, Transform
 from calibrate.kinematics import RobotModel
@@ -391,7 +391,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 def decode_calibration(content: bytes, where: str) -> Calibration:
     """Verify and parse a file's bytes; CalibrationFileError says what is wrong."""
-    plain = proven_plain(content, where)
+    plain = verified_plain(content, where)
     try:
         calibration = msgspec.convert(plain, Calibration)
     except msgspec.ValidationError as problem:

@@ -13,7 +13,7 @@ import numpy as np
 
 from calibrate.errors import CalibrationError, CalibrationFileError, InstallError
 from calibrate.files.folders import calibrations_folder, current_version, readable_folder, validity_of
-from calibrate.files.proof import check_result, proven_plain, read_bounded
+from calibrate.files.integrity import check_result, read_bounded, verified_plain
 from calibrate.files.validity import (
     Validity,
     ValidityReason,
@@ -137,7 +137,7 @@ def load_installed(
 def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
     folder = readable_folder(root, camera)
     number, path = current_version(folder)
-    plain = proven_plain(read_bounded(path), str(path))
+    plain = verified_plain(read_bounded(path), str(path))
     try:
         check_result(plain, str(path))
     except (KeyError, TypeError, ValueError) as problem:

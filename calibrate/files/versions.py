@@ -39,8 +39,8 @@ from calibrate.files.folders import (
     read_validity,
     readable_folder,
 )
+from calibrate.files.integrity import read_bounded
 from calibrate.files.lines import append_line, read_lines, share
-from calibrate.files.proof import read_bounded
 from calibrate.files.touch import LIMIT_SIGMAS, Touch, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, time_text, unrecorded

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from calibrate.files.exports.frames import ExportError
 from calibrate.files.exports.robot import Urdf, origin_of
-from calibrate.files.proof import read_bounded
+from calibrate.files.integrity import read_bounded
 from calibrate.geometry import quaternion_from_matrix
 from recordings import strict_yaml
 from recordings.importers.bags import open_bag

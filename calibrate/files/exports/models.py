@@ -18,7 +18,7 @@ from calibrate.files.exports.frames import (
     comment,
     how_to_attach,
 )
-from calibrate.files.proof import content_sha256
+from calibrate.files.integrity import content_sha256
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
 from calibrate.kinematics import RobotModel, link_frames
 

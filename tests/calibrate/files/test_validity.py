@@ -20,7 +20,7 @@ from calibrate.errors import CalibrationFileError, InstallError, UsageError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.folders import cameras
 from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
-from calibrate.files.proof import canonical_json
+from calibrate.files.integrity import canonical_json
 from calibrate.files.touch import Touch
 from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState, validity_text
 from calibrate.files.versions import installed_versions, note_installed

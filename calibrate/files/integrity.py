@@ -31,7 +31,7 @@ def read_bounded(path: Path) -> bytes:
         raise CalibrationFileError(path=path, why=problem.strerror or str(problem)) from None
 
 
-def proven_plain(content: bytes, where: str) -> dict[str, Any]:
+def verified_plain(content: bytes, where: str) -> dict[str, Any]:
     """Parse a calibration file to plain data without `sha256`, after verifying its hash.
 
     CalibrationFileError says what is wrong.

@@ -82,16 +82,6 @@ class Recorder:
         self._thread.start()
 
     @property
-    def bytes_written(self) -> int:
-        """Handed to the operating system so far."""
-        return self._writer.bytes_written
-
-    @property
-    def last_sync_s(self) -> float:
-        """Duration of the newest fdatasync."""
-        return self._writer.last_sync_s
-
-    @property
     def alive(self) -> bool:
         """The writer's thread works; false after finish, close or an error."""
         return self._thread.is_alive()

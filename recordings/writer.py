@@ -239,16 +239,6 @@ class RecordingWriter:
     ) -> None:
         self.close()
 
-    @property
-    def last_sync_s(self) -> float:
-        """Duration of the newest sync."""
-        return self._background.last_s
-
-    @property
-    def bytes_written(self) -> int:
-        """Handed to the operating system so far."""
-        return self._file.size_bytes
-
     def _time_ns(self, stamps: Stamps, place: int = 0) -> int:
         """Wall time where there is one; imported images have none and follow each other by a second."""
         return stamps.host_wall_ns or self._start_ns + place * _SECOND_NS
@@ -329,8 +319,6 @@ class BackgroundSync:
         self._descriptor = descriptor
         self._thread: threading.Thread | None = None
         self._error: OSError | None = None
-        self.last_s = 0.0
-        """Duration of the newest one."""
 
     @property
     def busy(self) -> bool:
@@ -350,7 +338,6 @@ class BackgroundSync:
             raise self._error
 
     def _sync(self) -> None:
-        start_s = time.monotonic()
         try:
             getattr(os, "fdatasync", os.fsync)(self._descriptor)  # macOS has no fdatasync
             surplus = os.fstat(self._descriptor).st_size - KEPT_IN_MEMORY_BYTES
@@ -358,4 +345,3 @@ class BackgroundSync:
                 os.posix_fadvise(self._descriptor, 0, surplus, os.POSIX_FADV_DONTNEED)
         except OSError as error:
             self._error = error
-        self.last_s = time.monotonic() - start_s

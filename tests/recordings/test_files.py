@@ -38,7 +38,7 @@ def test_the_name_is_there_only_after_finish(tmp_path: Path) -> None:
     with RecordingWriter(path, make_info()) as writer:
         writer.image(make_picture(0))
         assert not path.exists()
-        assert writer.part_path.stat().st_size == writer.bytes_written > 0
+        assert writer.part_path.stat().st_size > 0
         writer.finish()
     assert path.exists()
     assert not writer.part_path.exists()

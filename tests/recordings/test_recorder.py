@@ -99,7 +99,7 @@ def test_sync_resolves_only_after_fdatasync_of_what_came_before(
 
     def view(writer: RecordingWriter, written: object) -> None:
         real_view(writer, written)  # type: ignore[arg-type]
-        order.append(f"view {writer.bytes_written}")
+        order.append(f"view {writer.part_path.stat().st_size}")
 
     monkeypatch.setattr(os, "fdatasync", fdatasync)
     monkeypatch.setattr(RecordingWriter, "view", view)

@@ -66,8 +66,8 @@ class Daemon:
         self.session = Session(cell, root)
         dispatcher = SessionDispatcher(self.session)
         self._control = ControlServer(control, dispatcher, newest=lambda: self.session.store.status)
-        self._stop = StopServer(control, dispatcher.stop_by_datagram, self._latched, self._speed_rad_s)
-        self.session.supervisor.first = self._stop.round
+        self._stop_server = StopServer(control, dispatcher.stop_by_datagram, self._latched, self._speed_rad_s)
+        self.session.supervisor.first = self._stop_server.round
         self.session.supervisor.ticked = self._ping
         self._watchdog_s, self._pinged_s = watchdog_period_s(), 0.0
         self._changed = asyncio.Event()
@@ -83,7 +83,7 @@ class Daemon:
             loop.add_signal_handler(number, self.end)
         await self._control.start()
         try:
-            self._stop.start()
+            self._stop_server.start()
             await self.session.start()
             self.session.store.watch(self._changed.set)
             freeze_startup()
@@ -97,7 +97,7 @@ class Daemon:
             await self.session.close()
             notify("STOPPING=1")
             await self._control.close()
-            self._stop.close()
+            self._stop_server.close()
             log.info("ended")
 
     def end(self) -> None:

@@ -21,7 +21,7 @@ from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
 from station.protocol.messages import LINE_LIMIT_BYTES, Answer, Request
 from station.protocol.stop_client import send_stop
-from station.protocol.verbs import Hello, Verb
+from station.protocol.verbs import Hello, Stop, Verb
 
 R = TypeVar("R")
 
@@ -120,9 +120,10 @@ class Client:
     def connected(self) -> bool:
         return self._writer is not None
 
-    def send_stop(self) -> bool:
-        """Send STOP by its own socket, which needs no connection; False: nobody listens there."""
-        return send_stop(self._path)
+    def send_stop(self) -> str:
+        """Send STOP by its own socket, which needs no connection; say why it was not sent, empty: it was."""
+        unsent = send_stop(self._path)
+        return "" if unsent is None else unsent.told(self._path)
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
         """Carry out a verb; return its result. Raises RefusedError, DaemonGoneError, NoAnswerError."""
@@ -133,8 +134,8 @@ class Client:
 
     async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: object) -> object:
         """Carry out a verb by its name; return its result as plain data."""
-        if verb == "stop":
-            self.send_stop()  # by STOP's own socket, which cannot be delayed; then ask for the answer
+        if verb == Stop.verb():
+            self.send_stop()  # which cannot be delayed; then ask for the answer (`stop_client` says why both)
         if (writer := self._writer) is None:
             raise DaemonGoneError("connection-lost", path=self._path)
         request = Request(self._next_id, verb, msgspec.Raw(msgspec.json.encode(args)))

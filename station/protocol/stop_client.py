@@ -1,4 +1,8 @@
-"""`station stop`, without slow imports: sends a datagram, then checks its effect.
+"""STOP as everybody sends it: one datagram. `station stop`, without slow imports, then checks its effect.
+
+Every sender is here: `station stop`, the process that reads the screen's F12 (`tui.stop_key`), and the screen
+itself (`protocol.client`). The screen sends it too because its block can be clicked and a terminal may be
+without that process, and asks the verb `stop` besides: a datagram has no answer. A STOP more does no harm.
 
 STOP is sent to whatever listens on the socket. It is reported as done only if the genuine daemon says so on
 the motion page, a small file beside the socket that only the daemon's user can have made. It tells how many
@@ -38,7 +42,9 @@ REST_S = 3.0
 _LOOK_S = 0.005
 
 
-class Motion(IntEnum):
+class ArmMotion(IntEnum):
+    """What the newest state of the robot says."""
+
     UNKNOWN = 0
     """No current state from the robot"""
     MOVES = 1
@@ -47,7 +53,7 @@ class Motion(IntEnum):
 
 class Page(NamedTuple):
     pid: int
-    motion: Motion
+    motion: ArmMotion
     stops: int
     """Number of STOPs carried out since the daemon's start."""
 
@@ -89,9 +95,9 @@ def read_page(descriptor: int | None) -> Page | None:
     if len(raw) != _LAYOUT.size or raw != os.pread(descriptor, _LAYOUT.size, 0):  # just being written
         return None
     magic, pid, motion, stops = _LAYOUT.unpack(raw)
-    if magic != _MAGIC or motion not in Motion._value2member_map_:
+    if magic != _MAGIC or motion not in ArmMotion._value2member_map_:
         return None
-    return Page(pid, Motion(motion), stops)
+    return Page(pid, ArmMotion(motion), stops)
 
 
 class Outcome(Enum):
@@ -106,6 +112,10 @@ class Outcome(Enum):
     NO_DAEMON = "No station daemon serves {socket}: STOP reached nobody. Press the emergency stop."
     DENIED = "{socket}: not allowed (group station-operator is). Press the emergency stop."
     UNTRUSTED = "{reason} Whatever answers there may not be the station. Press the emergency stop."
+
+    def told(self, control: Path, reason: str = "") -> str:
+        """Words for people; `reason`: why it is UNTRUSTED."""
+        return self.value.format(socket=control, reason=reason)
 
 
 def main(arguments: Sequence[str]) -> int | None:
@@ -123,19 +133,27 @@ def main(arguments: Sequence[str]) -> int | None:
 def stop_and_tell(control: Path) -> int:
     outcome, reason = stop(control)
     good = outcome is Outcome.RESTS
-    words = outcome.value.format(socket=control, reason=reason)
+    words = outcome.told(control, reason)
     print(words if good else f"station: {words}", file=sys.stdout if good else sys.stderr)
     return 0 if good else 1
 
 
-def send_stop(control: Path) -> bool:
-    """Send STOP without waiting for its effect; False: it could not be sent."""
+def send_stop(control: Path) -> Outcome | None:
+    """Send STOP without waiting for its effect; None: it was sent, else why it was not."""
     try:
-        with _link(control) as link:
-            link.send(b"STOP")
-    except OSError:
-        return False
-    return True
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+            link.setblocking(False)
+            link.connect(str(stop_socket(control)))
+            with contextlib.suppress(BlockingIOError):
+                # A full queue holds nothing but STOPs, so the daemon stops the arm anyway.
+                link.send(b"STOP")
+    except (FileNotFoundError, ConnectionRefusedError):
+        return Outcome.NO_DAEMON
+    except PermissionError:
+        return Outcome.DENIED
+    except OSError:  # a name too long, another kind of socket
+        return Outcome.SILENT
+    return None
 
 
 def stop(control: Path) -> tuple[Outcome, str]:
@@ -156,25 +174,17 @@ def stop(control: Path) -> tuple[Outcome, str]:
             return Outcome.UNTRUSTED, f"{error.filename}: {error.strerror}."
         page = None
     try:
-        return _stop(control, page), ""
+        return _send_and_watch(control, page), ""
     finally:
         if page is not None:
             os.close(page)
 
 
-def _stop(control: Path, page: int | None) -> Outcome:
+def _send_and_watch(control: Path, page: int | None) -> Outcome:
     give_up_s = time.monotonic() + HEARD_S
     before = read_page(page)
-    try:
-        with _link(control) as link, contextlib.suppress(BlockingIOError):
-            # A full queue holds nothing but STOPs, so the daemon stops the arm anyway.
-            link.send(b"STOP")
-    except (FileNotFoundError, ConnectionRefusedError):
-        return Outcome.NO_DAEMON
-    except PermissionError:
-        return Outcome.DENIED
-    except OSError:  # a name too long, another kind of socket
-        return Outcome.SILENT
+    if (unsent := send_stop(control)) is not None:
+        return unsent
     while page is not None and time.monotonic() < give_up_s:
         now = read_page(page)
         if before is not None and now is not None and now.stops > before.stops:
@@ -184,24 +194,13 @@ def _stop(control: Path, page: int | None) -> Outcome:
     return Outcome.SILENT
 
 
-def _link(control: Path) -> socket.socket:
-    link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    try:
-        link.setblocking(False)
-        link.connect(str(stop_socket(control)))
-    except OSError:
-        link.close()
-        raise
-    return link
-
-
 def _until_rest(page: int) -> Outcome:
     give_up_s = time.monotonic() + REST_S
-    motion = Motion.UNKNOWN
+    motion = ArmMotion.UNKNOWN
     while time.monotonic() < give_up_s:
         if (now := read_page(page)) is not None:
             motion = now.motion
-            if motion is Motion.RESTS:
+            if motion is ArmMotion.RESTS:
                 return Outcome.RESTS
         time.sleep(_LOOK_S)
-    return Outcome.MOVES if motion is Motion.MOVES else Outcome.UNKNOWN
+    return Outcome.MOVES if motion is ArmMotion.MOVES else Outcome.UNKNOWN

@@ -27,7 +27,7 @@ from station.protocol.messages import (
     Answer,
     Request,
 )
-from station.protocol.verbs import VERBS
+from station.protocol.verbs import VERBS, Stop
 from station.server.approval import Peer
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ class _Connection:
             self.hang_up()
 
     def _take(self, request: Request) -> None:
-        if request.verb == "stop":
+        if request.verb == Stop.verb():
             # Before any limit is checked and any later line is read.
             stopping = self._handler.stop_by_client(self.peer)
             self._spawn(self._answer_stop(request.id, stopping))

@@ -20,7 +20,7 @@ from pathlib import Path
 from station.cell.errors import StationError
 from station.cell.socket_folder import bind, make_folder, motion_page, stop_socket
 from station.cell.stillness import RESTING_RAD_S
-from station.protocol.stop_client import Motion, Page, create_page, write_page
+from station.protocol.stop_client import ArmMotion, Page, create_page, write_page
 from station.server.approval import Peer
 
 log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class StopServer:
         speed_rad_s: Callable[[], float | None],
     ) -> None:
         self._socket_path, self._page_path = stop_socket(control), motion_page(control)
-        self._stop, self._latched, self._speed_rad_s = stop, latched, speed_rad_s
+        self._stop_arm, self._latched, self._speed_rad_s = stop, latched, speed_rad_s
         self._link: socket.socket | None = None
         self._stops = 0
         self._latched_s = self._repeated_s = float("-inf")
@@ -129,17 +129,17 @@ class StopServer:
         elif not self._moves() and now_s - self._repeated_s < REPEAT_S:
             return  # the next round updates the page
         self._repeated_s = now_s
-        self._stop(sender)
+        self._stop_arm(sender)
         self._tell()
 
     def _page(self) -> Page:
         return Page(os.getpid(), self._motion(), self._stops)
 
-    def _motion(self) -> Motion:
+    def _motion(self) -> ArmMotion:
         if self._speed_rad_s() is None:
-            return Motion.UNKNOWN
+            return ArmMotion.UNKNOWN
         just_stopped = time.monotonic() - self._latched_s < SETTLE_S
-        return Motion.MOVES if self._moves() or just_stopped else Motion.RESTS
+        return ArmMotion.MOVES if self._moves() or just_stopped else ArmMotion.RESTS
 
     def _moves(self) -> bool:
         speed_rad_s = self._speed_rad_s()

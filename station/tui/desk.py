@@ -33,7 +33,6 @@ STATUS_PERIOD_S = 0.25
 """Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
 RECONNECT_S = 1.0
 GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
-STOP_NOBODY = "STOP reached nobody: no station runs. If the arm moves, press the EMERGENCY STOP."
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
 REMEDIES = {
     "nothing-installed": "4 shows the newest result, i installs it.",
@@ -183,10 +182,10 @@ class Desk:
     async def stop(self) -> None:
         """STOP, whatever is shown, and also where nobody answers or no connection is left."""
         if not self.client.connected:
-            if self.client.send_stop():
-                self.app.notify("STOP was sent without a connection: look at the arm.", severity="warning")
+            if unsent := self.client.send_stop():
+                self.app.notify(unsent, severity="error", timeout=10, markup=False)
             else:
-                self.app.notify(STOP_NOBODY, severity="error", timeout=10)
+                self.app.notify("STOP was sent without a connection: look at the arm.", severity="warning")
             return
         if self.known.silent_s is not None:
             self.app.notify(STOP_UNHEARD, severity="error", timeout=10)

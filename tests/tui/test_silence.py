@@ -89,9 +89,9 @@ async def test_without_a_connection_stop_is_sent_all_the_same(heard: bool, told:
         async def open(self) -> Client:
             raise DaemonGoneError("16 clients of this user are connected already")
 
-        def send_stop(self) -> bool:
+        def send_stop(self) -> str:
             sent.append(True)
-            return heard
+            return "" if heard else "nobody heard it: EMERGENCY STOP"
 
     sent: list[bool] = []
     async with app_on(Nobody()).run_test(size=(80, 24), notifications=True) as pilot:

@@ -22,7 +22,6 @@ from station.cell.status import (
 )
 from station.operate.draft import Hardware
 from station.protocol.verbs import Check
-from station.tui.desk import STOP_NOBODY
 from station.tui.dialogs import Confirm, ConfirmMotion, Reason
 from station.tui.frame import StopBlock, bar_line, next_line, rail_line
 from station.tui.new_cell import NewCell
@@ -220,7 +219,7 @@ async def test_the_screens_have_no_stop_for_an_arm_that_a_person_moves(
         link.show(None)  # what arm the next daemon has is not known: STOP is for it, too
         await until(pilot, lambda: pilot.app.known.live is None)  # type: ignore[attr-defined]
         await pilot.press("f12")
-        await until(pilot, lambda: STOP_NOBODY in said(pilot))
+        await until(pilot, lambda: link.send_stop() in said(pilot))
 
 
 async def test_stop_can_be_clicked_in_the_wizard_too(tmp_path: Path) -> None:

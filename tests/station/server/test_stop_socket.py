@@ -26,7 +26,7 @@ from station.cell.socket_folder import (
 from station.protocol.client import Client
 from station.protocol.messages import USER_CLIENT_LIMIT
 from station.protocol.stop_client import (
-    Motion,
+    ArmMotion,
     Outcome,
     Page,
     create_page,
@@ -150,7 +150,7 @@ async def test_of_a_flood_only_so_much_reaches_the_loop_and_another_stop_is_conf
 async def test_a_stop_after_an_acknowledgement_is_carried_out_however_soon_it_comes(station: Station) -> None:
     assert await stopped(station.control) is Outcome.RESTS
     station.latched = False
-    assert send_stop(station.control)
+    assert send_stop(station.control) is None
     await until(lambda: len(station.heard) == 2)
 
 
@@ -158,6 +158,11 @@ async def test_a_daemon_that_hangs_is_not_believed(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
     hung = Station(tmp_path / "c.sock")
     hung.server.start()  # and nobody reads
+    assert stop(hung.control)[0] is Outcome.SILENT
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link, pytest.raises(BlockingIOError):
+        while link.sendto(b"x", socket.MSG_DONTWAIT, str(stop_socket(hung.control))):
+            pass
+    assert send_stop(hung.control) is None  # the queue is full of STOPs
     assert stop(hung.control)[0] is Outcome.SILENT
     hung.server.close()
 
@@ -345,11 +350,11 @@ def test_without_a_runtime_folder_the_socket_lies_where_nobody_else_can_be_first
 
 def test_the_page_is_read_as_it_was_written_and_nothing_else_is_taken_for_one(tmp_path: Path) -> None:
     path = tmp_path / "c.motion"
-    written = create_page(path, Page(7, Motion.MOVES, 3))
+    written = create_page(path, Page(7, ArmMotion.MOVES, 3))
     read = open_page(path, {os.getuid()})
-    assert read_page(read) == Page(7, Motion.MOVES, 3)
-    write_page(written, Page(7, Motion.RESTS, 4))
-    assert read_page(read) == Page(7, Motion.RESTS, 4)
+    assert read_page(read) == Page(7, ArmMotion.MOVES, 3)
+    write_page(written, Page(7, ArmMotion.RESTS, 4))
+    assert read_page(read) == Page(7, ArmMotion.RESTS, 4)
     os.pwrite(written, b"\xff" * 24, 0)
     assert read_page(read) is None
     os.ftruncate(written, 5)

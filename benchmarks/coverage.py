@@ -19,8 +19,8 @@ from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.pairs import all_pairs, mount_poses
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
+from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import LensModel
-from calibrate.pipeline import single_threaded_opencv
 from recordings.schema.messages import Mount
 
 TRIALS = 200

@@ -21,7 +21,7 @@ from benchmarks.real_sets import DATASETS
 from benchmarks.trials import table
 from calibrate.geometry import Array, inverse
 from calibrate.imported import Given, believe, board
-from calibrate.pipeline import single_threaded_opencv, solve_recording
+from calibrate.job import single_threaded_opencv, solve_recording
 from recordings.errors import ImportSourceError
 from recordings.importers.dataset import Dataset, read_dataset, read_poses
 from recordings.importers.folder import write_views

@@ -13,8 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibrate.job import JobOptions
-from calibrate.pipeline import solve_recording
+from calibrate.job import JobOptions, solve_recording
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel
 from tests.calibrate.sessions import Scene, write_session
@@ -27,7 +26,7 @@ LARGE = CameraModel(
 _PEAK = """
 import json, resource, sys
 from pathlib import Path
-from calibrate.pipeline import solve_recording
+from calibrate.job import solve_recording
 solve_recording(Path(sys.argv[1]))
 print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
 """

@@ -15,8 +15,8 @@ from calibrate.gates import judge
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
+from calibrate.job import single_threaded_opencv
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline import single_threaded_opencv
 from calibrate.views import BoardView, Places, ViewSet
 from recordings.schema.messages import Mount
 

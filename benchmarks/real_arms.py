@@ -23,9 +23,9 @@ from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
 from calibrate.handeye.metrics import mean_pose
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
+from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline import single_threaded_opencv
 from calibrate.views import Places, ViewSet
 from recordings.schema.messages import BoardSpec
 

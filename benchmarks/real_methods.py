@@ -16,9 +16,9 @@ from calibrate.handeye.axxb.peer_methods import HAND_EYE, ROBOT_WORLD, opencv_ha
 from calibrate.handeye.reprojection import bent_points
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
+from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline import single_threaded_opencv
 from calibrate.views import BoardView, ViewSet, observe_views
 from recordings.schema.messages import BoardSpec, CameraModel
 

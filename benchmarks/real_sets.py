@@ -12,9 +12,9 @@ import numpy as np
 import yaml
 
 from calibrate.geometry import Array, project_to_rotation
+from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline import single_threaded_opencv
 from calibrate.recorded_views import load_views
 from calibrate.views import ViewSet
 from recordings.importers.folder import import_folder

@@ -48,12 +48,12 @@ if TYPE_CHECKING:
     from calibrate.gates import GateLimits as GateLimits
     from calibrate.geometry import Transform as Transform
     from calibrate.job import JobOptions as JobOptions
-    from calibrate.job import Solved as Solved
     from calibrate.job import SolvedRecording as SolvedRecording
+    from calibrate.job import solve_recording as solve_recording
     from calibrate.pictures import SolvedPictures as SolvedPictures
     from calibrate.pictures import read_folder as read_folder
     from calibrate.pictures import solve as solve
-    from calibrate.pipeline import solve_recording as solve_recording
     from calibrate.results import Gate as Gate
+    from calibrate.solved import Solved as Solved
 
 __getattr__, __all__ = open_door(__name__, __file__)

@@ -1,31 +1,42 @@
-"""What an offline job is given, and what it makes of a recording."""
+"""Offline job: a recording in, a solved and judged calibration out. No files are written here.
+
+`prepare_views` finds boards, lens and board poses (`recorded_views`, `lens`), `solve_recording` solves
+(`handeye`), judges (`gates`) and puts the calibration together (`document`). `pictures` does the same for
+pictures and poses that a program holds.
+"""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from io import BytesIO
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from pathlib import Path
+from typing import Any, get_args
 
+import cv2
 import msgspec
 import numpy as np
 
+from calibrate.boards.model import check_board
+from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError, require_choice
 from calibrate.files.calibration import Calibration
-from calibrate.gates import GateLimits
-from calibrate.geometry import Array
-from calibrate.handeye.reprojection import bent_points
-from calibrate.handeye.solution import Profile, Solution
-from calibrate.lens.intrinsics import Intrinsics, LensModel
-from calibrate.projection import project_at
-from calibrate.recorded_views import LoadedViews
-from calibrate.results import SHAPE, Gate
-from calibrate.views import BoardView, ViewSet, board_in_camera, observe_views
-from recordings.reader import Recording
-from recordings.schema.messages import BoardSpec, CameraModel
+from calibrate.gates import GateLimits, judge
+from calibrate.handeye.metrics import FEWEST_TO_SOLVE
+from calibrate.handeye.priors import BoardTolerance, LensPrior
+from calibrate.handeye.solution import Profile, Solution, SolveOptions
+from calibrate.handeye.solve import solve_views
+from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp, view_rms_px
+from calibrate.projection import intrinsics_names
+from calibrate.recorded_views import LoadedViews, Progress, load_views, without_views
+from calibrate.solved import Solved
+from calibrate.views import ViewSet
+from recordings.reader import Recording, open_recording
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+_MEDIAN_VIEW_PX = 20.0
 
 
 @dataclass(frozen=True)
@@ -82,97 +93,133 @@ class PreparedViews:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """X with its uncertainty, and what every picture says of it."""
-
-    views: ViewSet
-    """Pictures in which the board was found."""
-    solution: Solution
-    gates: tuple[Gate, ...]
-
-    @property
-    def passed(self) -> bool:
-        return all(gate.passed for gate in self.gates)
-
-    @property
-    def X(self) -> Array:
-        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), (4, 4), metres."""
-        return self.solution.matrix
-
-    @property
-    def lens(self) -> CameraModel:
-        """The given lens or the one found, as the fit left it."""
-        return self.solution.camera
-
-    def covariance(
-        self, order: Literal["translation-rotation", "rotation-translation"] = "translation-rotation"
-    ) -> Array:
-        """Return the covariance (6, 6), m and rad, of [δt, δφ], or of [δφ, δt].
-
-        X is Exp(δφ) times the estimate's rotation, and its translation plus δt: both in the axes of X's
-        parent frame, as in ROS's PoseWithCovariance. GTSAM and Sophus perturb in the child's.
-        """
-        require_choice("order", order, ("translation-rotation", "rotation-translation"))
-        shift = 3 * (order == "rotation-translation")
-        return np.roll(self.solution.covariance, (shift, shift), (0, 1))
-
-    @cached_property
-    def residuals_px(self) -> dict[int, Array]:
-        """Number of a picture → (k, 2): its corners less where calibration and recorded pose put them."""
-        solution, mount = self.solution, self.views.mount
-        observed = observe_views(replace(self.views, views=self._as_read))
-        shape = np.zeros(len(SHAPE)) if solution.board is None else solution.board.numbers
-        points = bent_points(observed, shape)
-        seen = board_in_camera(mount, observed.flange, self.X, solution.board_place.matrix)
-        return {
-            view.index: view.pixels - project_at(solution.camera, seen[i], points[i, : len(view.pixels)])
-            for i, view in enumerate(self._as_read)
-        }
-
-    @property
-    def _as_read(self) -> tuple[BoardView, ...]:
-        """The views with boards that look the same turned as the solver turned them."""
-        kept = {view.index: view for view in self.solution.kept}
-        return tuple(kept.get(view.index, view) for view in self.views)
-
-    def plot(self) -> Figure:
-        """Draw every residual, magnified, where it is in the image; a picture left out is red.
-
-        Needs matplotlib (the extra `report`). Raises BadViewsError for pairs of poses without corners.
-        """
-        if not any(len(view.pixels) for view in self.views):
-            raise BadViewsError("no-corners")
-        from matplotlib.figure import Figure
-
-        class Shown(Figure):
-            def _repr_png_(self) -> bytes:
-                """Show it in a notebook, for which a bare Figure has no picture."""
-                self.savefig(file := BytesIO())
-                return file.getvalue()
-
-        used, figure = set(self.solution.used), Shown(layout="constrained")
-        pixels = np.concatenate([view.pixels for view in self._as_read])
-        missed = np.concatenate(list(self.residuals_px.values()))
-        good = np.concatenate([[index in used] * len(miss) for index, miss in self.residuals_px.items()])
-        rms = float(np.sqrt(np.square(missed[good]).sum(axis=1).mean()))
-        longer = float(f"{self.lens.width / 40 / rms:.1g}")
-        axes = figure.subplots()
-        axes.quiver(
-            *pixels.T,
-            *missed.T * longer,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            width=1.5e-3,
-            color=np.where(good, "tab:blue", "tab:red"),
-        )
-        axes.set(xlim=(0, self.lens.width), ylim=(self.lens.height, 0), aspect="equal")
-        axes.set_title(f"{rms:.2f} px rms over {len(used)} pictures, drawn {longer:g} times as long")
-        return figure
-
-
-@dataclass(frozen=True, eq=False)
 class SolvedRecording(PreparedViews, Solved):
     calibration: Calibration
     solve_ms: float
     """Of everything, opening and detection included."""
+
+
+@contextmanager
+def single_threaded_opencv() -> Iterator[None]:
+    """OpenCV adds up in another order on every run when it uses its own threads."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+@single_threaded_opencv()
+def prepare_views(
+    path: Path,
+    options: JobOptions | None = None,
+    progress: Progress | None = None,
+    fewest: int = FEWEST_TO_SOLVE,
+) -> PreparedViews:
+    """Open, find the boards, the lens where it is not known, and the board poses.
+
+    Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
+    """
+    options = options or JobOptions()
+    recording = open_recording(path)
+    camera = options.camera
+    if options.find_intrinsics:
+        recorded = recording.info.camera
+        camera = CameraModel(recorded.width, recorded.height)
+    board = _board(options, recording.info.board)
+    loaded = load_views(recording, board, camera, progress, options.threads, fewest)
+    if options.without:
+        loaded = without_views(loaded, options.without, fewest)
+    views, intrinsics = with_board_poses(loaded.views, loaded.board, options.lens_model)
+    return PreparedViews(recording, loaded, views, intrinsics)
+
+
+def with_board_poses(
+    views: ViewSet, board: BoardSpec, model: LensModel = "plumb_bob"
+) -> tuple[ViewSet, Intrinsics | None]:
+    """Add `camera_from_board`, through the lens found from these views where the camera has none.
+
+    Views without corners stay as they are. Raises CalibrationError where no lens explains the corners, or the
+    given one does not.
+    """
+    if board.kind is BoardKind.UNSEEN:
+        return views, None
+    intrinsics = calibrate_intrinsics(views, model) if views.camera.matrix is None else None
+    if intrinsics is not None:
+        views = replace(views, camera=intrinsics.camera)
+    views = solve_pnp(views, board)
+    median = float(np.median([view_rms_px(v, views.camera, v.camera_from_board) for v in views]))  # type: ignore[arg-type]
+    if not median <= _MEDIAN_VIEW_PX:
+        raise BadViewsError("lens-misfit", median_px=median, limit_px=_MEDIAN_VIEW_PX)
+    return views, intrinsics
+
+
+def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions:
+    return SolveOptions(
+        profile=options.profile,
+        seed=options.seed,
+        intrinsics_from_same_pictures=prepared.intrinsics is not None,
+        lens_sigma=_lens_sigma(options, prepared.views.camera),
+        board=BoardTolerance.of(prepared.loaded.board),
+        working_distance_m=options.working_distance_m,
+        robot_accuracy_m=options.robot_accuracy_m,
+        robot_accuracy_rad=options.robot_accuracy_rad,
+    )
+
+
+@single_threaded_opencv()
+def solve_recording(
+    path: Path,
+    options: JobOptions | None = None,
+    progress: Progress | None = None,
+) -> SolvedRecording:
+    """Solve and judge a recording. Raises RecordingError or CalibrationError; each says what to do next."""
+    options = options or JobOptions()
+    begun_s = time.perf_counter()
+    prepared = prepare_views(path, options, progress)
+    recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
+    solution = solve_views(views, solver_options(options, prepared))
+    gates = judge(solution, options.limits, _clock_bound_s(recording, solution))
+    calibration = make_calibration(
+        recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen
+    )
+    return SolvedRecording(
+        **vars(prepared),
+        solution=solution,
+        gates=gates,
+        calibration=calibration,
+        solve_ms=1e3 * (time.perf_counter() - begun_s),
+    )
+
+
+_FIXED = 1e-9
+"""1σ of a number that the lens' calibration held fixed."""
+
+
+def _lens_sigma(options: JobOptions, camera: CameraModel) -> tuple[float, ...] | None:
+    """Take the stated 1σ; zero: held fixed, not stated: the usual one. None where none is stated."""
+    stated = options.camera_sigma
+    if options.camera is None or not any(sigma > 0 for sigma in stated.values()):
+        return None
+    usual = zip(intrinsics_names(camera), LensPrior.given(camera).sigma, strict=True)
+    return tuple(max(stated.get(name, float(sigma)), _FIXED) for name, sigma in usual)
+
+
+def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:
+    board = options.board or recorded
+    if board.kind is BoardKind.UNSEEN and options.square_m is None:
+        return board
+    check_board(board)
+    if options.square_m is not None:
+        ratio = options.square_m / board.square_m
+        marker_m = None if board.marker_m is None else board.marker_m * ratio
+        board = msgspec.structs.replace(board, square_m=options.square_m, marker_m=marker_m)
+        check_board(board)
+    return board
+
+
+def _clock_bound_s(recording: Recording, solution: Solution) -> float | None:
+    used = set(solution.used)
+    bounds = [v.time_bound_s for v in recording.views() if v.index in used and v.time_bound_s is not None]
+    return max(bounds) if bounds else None

@@ -22,8 +22,8 @@ from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.imported import Given, believe, is_described
-from calibrate.job import Solved
-from calibrate.pipeline import single_threaded_opencv, with_board_poses
+from calibrate.job import single_threaded_opencv, with_board_poses
+from calibrate.solved import Solved
 from calibrate.views import BoardView, ViewSet, array_of
 from recordings.errors import ImportSourceError
 from recordings.files import usable_cores

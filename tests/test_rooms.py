@@ -21,7 +21,7 @@ OF_THE_STATION = (
 
 
 def test_offline_rooms_load_nothing_of_the_station() -> None:
-    program = "import sys, calibrate.cli.app, calibrate.pipeline, recordings.cli.commands\n"
+    program = "import sys, calibrate.cli.app, calibrate.job, recordings.cli.commands\n"
     program += f"import calibrate.cli.importing; print([m for m in {OF_THE_STATION!r} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -33,7 +33,7 @@ PLANTS = [
     ("recordings/schema", "rosbags"),
     ("calibrate/files", "station.cell"),
     ("calibrate/handeye", "calibrate.files"),
-    ("calibrate/boards", "calibrate.pipeline"),
+    ("calibrate/boards", "calibrate.job"),
     ("calibrate/check", "serial"),
     ("calibrate/check", "mcap"),
     ("station/analysis", "textual"),

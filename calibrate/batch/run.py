@@ -19,8 +19,7 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration, write_output
 from calibrate.files.integrity import content_sha256
 from calibrate.files.lines import append_line, read_lines
-from calibrate.job import JobOptions, SolvedRecording
-from calibrate.pipeline import solve_recording
+from calibrate.job import JobOptions, SolvedRecording, solve_recording
 from calibrate.resource_limits import Limits, bounded
 from recordings.errors import RecordingError
 from recordings.plain_text import plain_text

@@ -26,8 +26,7 @@ from calibrate.files.calibration import Calibration, Provenance
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
 from calibrate.files.validity import Validity, ValidityReason, validity_text
-from calibrate.job import JobOptions, PreparedViews
-from calibrate.pipeline import prepare_views
+from calibrate.job import JobOptions, PreparedViews, prepare_views
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.importers.dataset import DATASET_FILE
 from recordings.importers.folder import import_folder

@@ -15,7 +15,7 @@ import typer
 
 from calibrate.boards.model import typed_board
 from calibrate.imported import Given, believe, is_described
-from calibrate.pipeline import single_threaded_opencv
+from calibrate.job import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, import_bag

@@ -40,9 +40,8 @@ from calibrate.files.formatting import summary
 from calibrate.files.install import install_line
 from calibrate.geometry import roll_pitch_yaw
 from calibrate.handeye.solution import camera_frames
-from calibrate.job import JobOptions, SolvedRecording
+from calibrate.job import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 from calibrate.lens.intrinsics import LensModel
-from calibrate.pipeline import prepare_views, solve_recording, solver_options
 from calibrate.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits, bounded
 from calibrate.results import PeerResult
 

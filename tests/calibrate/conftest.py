@@ -9,8 +9,7 @@ import msgspec
 import pytest
 
 from calibrate.files.calibration import write_calibration
-from calibrate.job import SolvedRecording
-from calibrate.pipeline import solve_recording
+from calibrate.job import SolvedRecording, solve_recording
 from tests.calibrate.sessions import Scene, shifted, write_session
 
 

@@ -19,9 +19,8 @@ from calibrate.files import exports
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
 from calibrate.imported import Given, believe, board
-from calibrate.job import JobOptions
+from calibrate.job import JobOptions, solve_recording
 from calibrate.kinematics import MODELS
-from calibrate.pipeline import solve_recording
 from calibrate.report.page import report_page
 from recordings.cli import main
 from recordings.importers.conventions import possible

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import pose, rotation_exp
+from calibrate.job import solve_recording
 from calibrate.kinematics import forward
-from calibrate.pipeline import solve_recording
 from calibrate.recorded_views import arm_of_ros, load_views, without_views
 from calibrate.report.page import report_page
 from recordings.errors import MissingSegmentError

@@ -271,7 +271,7 @@ SOLVED = {
 
 
 def test_every_real_dataset_imports(datasets: Path, tmp_path: Path) -> None:
-    """But for those that tests/calibrate/test_pipeline.py imports and solves."""
+    """But for those that tests/calibrate/test_job.py imports and solves."""
     folders = {path.parent for path in datasets.glob("*/dataset.yaml") if path.parent.name not in SOLVED}
     assert folders
     for source in folders:

@@ -18,8 +18,14 @@ from calibrate.geometry import difference
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
-from calibrate.job import JobOptions, SolvedRecording
-from calibrate.pipeline import prepare_views, solve_recording, solver_options, with_board_poses
+from calibrate.job import (
+    JobOptions,
+    SolvedRecording,
+    prepare_views,
+    solve_recording,
+    solver_options,
+    with_board_poses,
+)
 from calibrate.views import ViewSet
 from recordings.importers.folder import import_folder
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel

@@ -32,12 +32,6 @@ MAGNIFIED = 50.0
 _FEWEST_VIEWS = 1
 
 
-class AnnotateError(CalibrationError):
-    """The calibration and the recording do not belong together."""
-
-    code = "not-of-recording"
-
-
 @dataclass(frozen=True, eq=False)
 class ViewResidual:
     """Reprojection error of one view by robot pose, camera pose and board pose."""
@@ -52,15 +46,16 @@ class ViewResidual:
 def annotate(
     recording: Recording, calibration: Calibration, output: Path, progress: Progress | None = None
 ) -> list[ViewResidual]:
-    """Write `output` (.mcap), which must not exist. AnnotateError or RecordingError."""
+    """Write `output` (.mcap), which must not exist. CalibrationError or RecordingError."""
     camera, info = calibration.intrinsics.model, recording.info
     if (camera.width, camera.height) != (info.camera.width, info.camera.height):
-        raise AnnotateError(
+        raise CalibrationError(
+            "not-of-recording",
             calibrated=f"for {camera.width}×{camera.height} images",
             recorded=f"of {info.camera.width}×{info.camera.height}",
         )
     if calibration.mount != info.mount:
-        raise AnnotateError(calibrated=calibration.mount, recorded=info.mount)
+        raise CalibrationError("not-of-recording", calibrated=calibration.mount, recorded=info.mount)
     seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
     rejected = {view.index: view.reason for view in calibration.views.rejected}
     X, B = calibration.transform.matrix, calibration.board_place.transform.matrix

@@ -61,12 +61,6 @@ class DemoJson(msgspec.Struct, frozen=True):
     """How often the cell approved the rest by itself, after news that came late."""
 
 
-class DemoError(StationError):
-    """A step of the demonstration failed."""
-
-    code = "demo"
-
-
 def demo_command(
     seed: Seed = 0,
     output: Annotated[Path | None, typer.Option("--out", help="Folder for everything it makes")] = None,
@@ -171,7 +165,7 @@ def _solved(outcome: StationStatus) -> Calibration:
     session, why = outcome.session, outcome.reason or outcome.state.value
     if not session.recording:
         saved = f", saved in {session.folder}" if session.captured else ""
-        raise DemoError(
+        raise StationError(
             "demo-unfinished", captured=session.captured, poses=len(session.poses), saved=saved, why=why
         )
     folder = Path(session.folder)
@@ -180,7 +174,7 @@ def _solved(outcome: StationStatus) -> Calibration:
     command += ["--output", calibration, "--report", report]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode not in (0, _GATE_FAILED):
-        raise DemoError("demo-solve-failed", exit_code=done.returncode, said=done.stderr.strip())
+        raise StationError("demo-solve-failed", exit_code=done.returncode, said=done.stderr.strip())
     return read_calibration(Path(calibration))
 
 
@@ -188,7 +182,7 @@ def truth_error(recording: Path, found: Matrix4) -> tuple[float, float]:
     """Distance (mm) and angle (deg) of the found X from the truth that rides in a simulated recording."""
     attachment = open_recording(recording).attachments().get("truth.json")
     if attachment is None:
-        raise DemoError("not-simulated", path=recording)
+        raise StationError("not-simulated", path=recording)
     truth = msgspec.json.decode(attachment, type=CellTruth)
     delta = difference(np.array(found), np.array(truth.camera_mount))
     translation_mm = 1000 * float(np.linalg.norm(delta[:3]))

@@ -43,12 +43,6 @@ class DaemonGoneError(StationError):
     code = "no-daemon"
 
 
-class NoAnswerError(StationError):
-    """The daemon does not answer although connected: it hangs, or its computer is overloaded."""
-
-    code = "request-unanswered"
-
-
 def who_am_i() -> str:
     """Return user and terminal, as 'anna on tty1', by which others see who has control."""
     try:
@@ -126,7 +120,7 @@ class Client:
         return "" if unsent is None else unsent.told(self._path)
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
-        """Carry out a verb; return its result. Raises RefusedError, DaemonGoneError, NoAnswerError."""
+        """Carry out a verb; return its result. StationError, such as RefusedError, DaemonGoneError."""
         with self.guard(verb):
             answer = await self.request(verb.verb(), timeout_s=timeout_s, **msgspec.to_builtins(verb))
             result: R = msgspec.convert(answer, verb.result())
@@ -153,7 +147,7 @@ class Client:
             async with asyncio.timeout(timeout_s):
                 reply = await answer
         except TimeoutError:
-            raise NoAnswerError(verb=verb, timeout_s=timeout_s) from None
+            raise StationError("request-unanswered", verb=verb, timeout_s=timeout_s) from None
         except OSError:
             raise self._gone_error() from None
         finally:

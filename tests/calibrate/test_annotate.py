@@ -8,12 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.annotate import AnnotateError, annotate
+from calibrate.annotate import annotate
 from calibrate.cli import main
 from calibrate.files.calibration import read_calibration
 from calibrate.results import RejectedView
 from recordings.reader import open_recording
 from tests.calibrate.sessions import shifted
+from tests.codes import raises
 from tests.command_line import call
 from tests.recordings.small_recording import shown
 
@@ -80,7 +81,7 @@ def test_rejected_views_are_red_and_say_why(tmp_path: Path, solved: Path) -> Non
 def test_another_camera_is_refused(tmp_path: Path, solved: Path) -> None:
     calibration = read_calibration(solved)
     lens = msgspec.structs.replace(calibration.intrinsics, width=1280, height=1024)
-    with pytest.raises(AnnotateError):
+    with raises("not-of-recording"):
         annotate(
             open_recording(SAMPLE), msgspec.structs.replace(calibration, intrinsics=lens), tmp_path / "a.mcap"
         )

@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports import models, ros, vision
-from calibrate.files.exports.frames import ExportError as ExportError
 from calibrate.files.exports.frames import FrameNames as FrameNames
 from calibrate.files.exports.robot import corrected_urdf
 from calibrate.files.validity import require_usable
@@ -48,24 +48,24 @@ FORMATS: dict[str, Format] = {
 def export(
     calibration: Calibration, name: str, frames: FrameNames | None = None, arm: bytes | None = None
 ) -> bytes:
-    """Make the file's content. Raises ExportError for an unknown format, or one that cannot hold it.
+    """Make the file's content. Raises UsageError for an unknown format, or one that cannot hold it.
 
     arm: a URDF of the arm, to be written with its corrected joints and the camera that belongs to them.
 
     An installed calibration (`frames.validity`) in doubt or withdrawn is refused as by `load_installed`.
     """
     if name not in FORMATS:
-        raise ExportError(format=name, known=", ".join(FORMATS))
+        raise UsageError("export-format", format=name, known=", ".join(FORMATS))
     form, frames, usual = FORMATS[name], frames or FrameNames(), FrameNames()
     if frames.validity is not None:
         anyway = "a calibration file that is named is exported all the same"
         require_usable(frames.validity, "The installed calibration", anyway)
     if form.frames == "fixed" and (frames.base, frames.flange) != (usual.base, usual.flange):
-        raise ExportError("frames-of", format=name)
+        raise UsageError("frames-of", format=name)
     if frames.attach and form.frames != "attached":
-        raise ExportError("attach-of", format=name)
+        raise UsageError("attach-of", format=name)
     if arm is not None:
         if name != "urdf":
-            raise ExportError("arm-of-urdf")
+            raise UsageError("arm-of-urdf")
         return corrected_urdf(calibration, frames, arm)
     return form.make(calibration, frames).encode()

@@ -12,7 +12,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibrate.files.exports.frames import ExportError
+from calibrate.errors import UsageError
 from calibrate.files.exports.robot import Urdf, origin_of
 from calibrate.files.integrity import read_bounded
 from calibrate.geometry import quaternion_from_matrix
@@ -32,21 +32,21 @@ def fixed_frames(paths: Iterable[Path]) -> FrameTree:
     """Read static transforms: a bag's /tf_static, a URDF's fixed joints, or YAML as
     `ros2 topic echo /tf_static` prints it.
 
-    Raises ExportError for a file without any, or where a frame has two parents; ImportSourceError for a bag.
+    Raises UsageError for a file without any, or where a frame has two parents; ImportSourceError for a bag.
     """
     tree = FrameTree()
     for path in paths:
         try:
             found = list(_of_bag(path) if path.is_dir() or path.suffix in _BAGS else _of_text(path))
         except _NO_TRANSFORMS as problem:
-            raise ExportError("no-fixed-frames", path=path, why=repr(problem)) from None
+            raise UsageError("no-fixed-frames", path=path, why=repr(problem)) from None
         if not found:
-            raise ExportError("no-fixed-frames", path=path, why="there are none")
+            raise UsageError("no-fixed-frames", path=path, why="there are none")
         tree.add(found)
     parents: dict[str, str] = {}
     for parent, child in tree.edges:
         if parents.setdefault(child, parent) != parent:
-            raise ExportError("two-parents", frame=child, parent=f"{parents[child]} and {parent}")
+            raise UsageError("two-parents", frame=child, parent=f"{parents[child]} and {parent}")
     return tree
 
 

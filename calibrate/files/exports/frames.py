@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from calibrate.errors import CalibrationError
+from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration, source_stamp
 from calibrate.files.validity import Validity, validity_text
 from calibrate.geometry import Array, inverse, pose
@@ -27,13 +27,6 @@ _TURNED = {
 
 From ur_description. Other makers turn them otherwise.
 """
-
-
-class ExportError(CalibrationError):
-    """The format is unknown, or cannot hold this calibration."""
-
-    code = "export-format"
-    exit_code = 2
 
 
 @dataclass(frozen=True)
@@ -81,7 +74,7 @@ class FrameNames:
     def place(self, calibration: Calibration, X: Array) -> Array:
         """Compute the camera (4, 4) in the named parent from X (4, 4), the camera in the controller's frame.
 
-        Raises ExportError where the parent is turned against that frame and nobody says how.
+        Raises UsageError where the parent is turned against that frame and nobody says how.
         """
         parent = self.parent(calibration)
         own = "tool0" if calibration.mount == "eye-in-hand" else "base"
@@ -91,24 +84,24 @@ class FrameNames:
         if self.fixed.chain(parent, own):
             return self._between(parent, own) @ X
         if turned and calibration.robot.model not in MODELS:
-            raise ExportError("frame-turned", frame=parent, own=own)
+            raise UsageError("frame-turned", frame=parent, own=own)
         return np.asarray(_TURNED[turned][1] @ X if turned else X)
 
     def attached(self, parent: str, parent_from_camera: Array) -> Array:
         """Compute parent_from_attach (4, 4): the driver's frame `camera` is then the calibrated lens.
 
-        Raises ExportError where the driver has no such frames, or `attach` would get a second parent.
+        Raises UsageError where the driver has no such frames, or `attach` would get a second parent.
         """
         parents = {child: above for above, child in self.fixed.edges}
         if parents.get(self.attach, parent) != parent:
-            raise ExportError("two-parents", frame=self.attach, parent=parents[self.attach])
+            raise UsageError("two-parents", frame=self.attach, parent=parents[self.attach])
         lenses = sorted(
             name for name in parents if name.endswith("optical_frame") and self.fixed.chain(self.attach, name)
         )
         lens = self.camera if self.fixed.chain(self.attach, self.camera) or len(lenses) != 1 else lenses[0]
         if not self.fixed.chain(self.attach, lens):
             known = ", ".join(lenses) or "none"
-            raise ExportError("no-lens-frame", attach=self.attach, camera=self.camera, lenses=known)
+            raise UsageError("no-lens-frame", attach=self.attach, camera=self.camera, lenses=known)
         return np.asarray(parent_from_camera @ inverse(self._between(self.attach, lens)))
 
     def _between(self, parent: str, child: str) -> Array:

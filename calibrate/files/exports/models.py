@@ -10,14 +10,9 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
+from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration, CorrectedArm, DhTable
-from calibrate.files.exports.frames import (
-    BODY_FROM_OPTICAL,
-    ExportError,
-    FrameNames,
-    comment,
-    how_to_attach,
-)
+from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment, how_to_attach
 from calibrate.files.integrity import content_sha256
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
 from calibrate.kinematics import RobotModel, link_frames
@@ -79,21 +74,21 @@ _LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 def link_origins(table: DhTable) -> Array:
     """Compute the fixed transforms (6, 4, 4) before each joint's rotation about z, as URDF chains them.
 
-    Raises ExportError where the table has a transform after the last joint, which that chain cannot hold.
+    Raises UsageError where the table has a transform after the last joint, which that chain cannot hold.
     """
     a, d, alpha, theta, beta = (getattr(table, name) for name in table.__struct_fields__)
     model, after = RobotModel("corrected", a, d, alpha, theta, beta), [a[5], alpha[5], beta[5]]
     if np.abs(after).max() > 1e-12:
-        raise ExportError("table-behind-joint-6")
+        raise UsageError("table-behind-joint-6")
     axis = np.eye(3)[2]
     links = link_frames(model, np.zeros(6))[:6] @ pose(rotation_exp(np.outer(theta, axis)), np.outer(d, axis))
     return np.asarray(inverse(np.stack([np.eye(4), *links[:-1]])) @ links)
 
 
 def table_of(calibration: Calibration) -> CorrectedArm:
-    """Return the corrected arm, offered or not. Raises ExportError where there is none."""
+    """Return the corrected arm, offered or not. Raises UsageError where there is none."""
     if calibration.arm_table is None:
-        raise ExportError("no-arm-table")
+        raise UsageError("no-arm-table")
     return calibration.arm_table
 
 
@@ -102,7 +97,7 @@ def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
     arm = table_of(calibration)
     table, X = arm.installable()
     if table is None:
-        raise ExportError("no-ur-table")
+        raise UsageError("no-ur-table")
     placed = frames.place(calibration, X.matrix)
     values = numbers([*placed[:3, 3], *quaternion_from_matrix(placed[:3, :3])])
     note = (

@@ -17,8 +17,9 @@ from xml.parsers import expat
 import numpy as np
 
 from calibrate.chain import Chain
+from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration, CorrectedArm
-from calibrate.files.exports.frames import ExportError, FrameNames, comment
+from calibrate.files.exports.frames import FrameNames, comment
 from calibrate.files.exports.models import camera, commented, numbers, table_of
 from calibrate.geometry import (
     Array,
@@ -45,7 +46,7 @@ def corrected_urdf(calibration: Calibration, frames: FrameNames, given: bytes) -
     """Write the corrected origins into a URDF, and the camera pose that belongs to them.
 
     base_from_flange of the file is then that of the corrected arm. Where base and flange of the controller
-    are elsewhere than the links of these names, by a constant each, they stay so. Raises ExportError, where
+    are elsewhere than the links of these names, by a constant each, they stay so. Raises UsageError, where
     it is no plain URDF or not of this arm, and as `CorrectedArm.installable`.
     """
     arm = table_of(calibration)
@@ -59,7 +60,7 @@ def corrected_urdf(calibration: Calibration, frames: FrameNames, given: bytes) -
             )
         found, B, T = _recognise(list(_paths(robot, len(true.axes), frames)), arm)
     except (ElementTree.ParseError, expat.ExpatError, KeyError, TypeError, ValueError) as problem:
-        raise ExportError("urdf", why=str(problem)) from None
+        raise UsageError("urdf", why=str(problem)) from None
     origins, tip_from_flange = found.corrected(true.at(np.zeros(len(true.axes))), B, T)
     in_hand = calibration.mount == "eye-in-hand"
     parent, place = (found.tip, tip_from_flange) if in_hand else (found.base, inverse(B))
@@ -246,4 +247,4 @@ def _recognise(paths: list[_Path], arm: CorrectedArm) -> tuple[_Path, Array, Arr
             if (off < (_MAX_OFF_M, _MAX_OFF_RAD)).all():
                 return path, B, T
             least_m = min(least_m, float(off[0]))
-    raise ExportError("urdf-other-arm", off_mm=1e3 * least_m)
+    raise UsageError("urdf-other-arm", off_mm=1e3 * least_m)

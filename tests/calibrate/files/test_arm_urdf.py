@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.scene import random_rotation
 from calibrate.chain import Chain, learn_chain
-from calibrate.errors import BadViewsError, CalibrationFileError
+from calibrate.errors import BadViewsError, CalibrationFileError, UsageError
 from calibrate.files import exports
 from calibrate.files.calibration import (
     Calibration,
@@ -21,7 +21,7 @@ from calibrate.files.calibration import (
     decode_calibration,
     encode_calibration,
 )
-from calibrate.files.exports import ExportError, FrameNames
+from calibrate.files.exports import FrameNames
 from calibrate.geometry import Array, Transform, inverse, pose, rotation_exp
 from calibrate.job import SolvedRecording
 from tests.calibrate.chains import ROWS, DhArm
@@ -193,7 +193,7 @@ def test_a_table_is_written_into_a_urdf_too(calibration: Calibration) -> None:
 def test_another_arm_is_refused_with_the_distance(calibration: Calibration) -> None:
     calibration = with_arm(calibration, "seven joints")
     for other in ("seven, no offsets", "ur"):
-        with pytest.raises(ExportError) as refused:
+        with pytest.raises(UsageError) as refused:
             exports.export(calibration, "urdf", arm=urdf_of(other))
         assert refused.value.code == ("urdf-other-arm" if other != "ur" else "urdf")
         assert refused.value.values.get("off_mm", 99) > 10
@@ -213,18 +213,18 @@ def test_another_arm_is_refused_with_the_distance(calibration: Calibration) -> N
 )  # fmt: skip
 def test_what_is_no_plain_urdf_is_refused(solved_real: SolvedRecording, spoil: object) -> None:
     calibration = with_arm(solved_real.calibration, "seven joints")
-    with raises("urdf", ExportError):
+    with raises("urdf", UsageError):
         exports.export(calibration, "urdf", arm=spoil(urdf_of("seven joints")))  # type: ignore[operator]
 
 
 def test_names_and_formats_that_do_not_fit_are_refused(solved_real: SolvedRecording) -> None:
     calibration, given = with_arm(solved_real.calibration, "seven joints"), urdf_of("seven joints")
-    with pytest.raises(ExportError):
+    with pytest.raises(UsageError):
         exports.export(calibration, "urdf", FrameNames(flange="nowhere"), given)
     for name in ("halcon", "ur-kinematics"):
-        with raises("arm-of-urdf", ExportError):
+        with raises("arm-of-urdf", UsageError):
             exports.export(calibration, name, arm=given)
-    with raises("no-ur-table", ExportError):
+    with raises("no-ur-table", UsageError):
         exports.export(calibration, "ur-kinematics")
 
 

@@ -14,7 +14,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibrate.chain import chain_of
-from calibrate.errors import CalibrationError, InstallError
+from calibrate.errors import CalibrationError, InstallError, UsageError
 from calibrate.files import exports
 from calibrate.files.calibration import (
     Calibration,
@@ -24,7 +24,7 @@ from calibrate.files.calibration import (
     decode_calibration,
     encode_calibration,
 )
-from calibrate.files.exports import FORMATS, ExportError, FrameNames
+from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, rotation_exp
 from calibrate.job import SolvedRecording
@@ -134,7 +134,7 @@ def test_a_table_that_is_not_offered_is_not_exported(calibration: Calibration) -
     )
     with raises("table-not-offered", CalibrationError, reason="no-joints"):
         export(msgspec.structs.replace(calibration, arm_table=refused), "ur-kinematics")
-    with raises("no-arm-table", ExportError):
+    with raises("no-arm-table", UsageError):
         export(msgspec.structs.replace(calibration, arm_table=None), "ur-kinematics")
 
 
@@ -153,7 +153,7 @@ def test_beside_a_table_it_is_said_for_which_arm_the_pose_is(calibration: Calibr
 def test_names_of_robot_frames_are_written_or_refused(calibration: Calibration, name: str) -> None:
     try:
         text = export(calibration, name, FrameNames(base="its base", flange="its hand"))
-    except ExportError as refused:
+    except UsageError as refused:
         assert refused.code == "frames-of" and FORMATS[name].frames == "fixed"
     else:
         assert FORMATS[name].frames != "fixed" and "its " in text
@@ -284,7 +284,7 @@ def test_other_frame_names_and_unknown_formats(calibration: Calibration) -> None
     text = export(calibration, "ros-launch", FrameNames(base="cell_base", flange="flange_b", camera="cam"))
     parent = "flange_b" if calibration.mount == "eye-in-hand" else "cell_base"
     assert f"'{parent}'" in text and "'cam'" in text
-    with pytest.raises(ExportError):
+    with pytest.raises(UsageError):
         export(calibration, "nix")
 
 

@@ -18,6 +18,7 @@ import pytest
 import typer
 
 from recordings.errors import CodedError, ErrorReport
+from station.cell.errors import StationError
 from station.cell.pose_plan import plan_sha256
 from station.cell.status import MotionPreview
 from station.cli import main, session
@@ -25,7 +26,6 @@ from station.cli.app import STATION
 from station.cli.daemon import tell_what_goes_on
 from station.cli.demo import simulated_daemon
 from station.plan.files import load_plan
-from station.protocol.client import NoAnswerError
 from station.protocol.states import RUNNING
 from tests.command_line import call
 from tests.patience import PATIENCE_S, wait_until
@@ -107,7 +107,7 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
 async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     class Hanging:
         async def call(self, verb: object, *, timeout_s: float) -> None:
-            raise NoAnswerError(f"no answer from the daemon within {timeout_s:.0f} s.")
+            raise StationError("request-unanswered", verb="stop", timeout_s=timeout_s)
 
     await session.stop_and_say(Hanging())  # type: ignore[arg-type]
     said = capsys.readouterr().err

@@ -30,13 +30,7 @@ from calibrate.views import ViewSet
 from recordings.importers.folder import import_folder
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from tests.calibrate.cells import error_mm_deg, inside
-from tests.calibrate.sessions import (
-    CAMERA,
-    SYMMETRIC_BOARD,
-    X_TRUE,
-    Scene,
-    write_session,
-)
+from tests.calibrate.sessions import CAMERA, SYMMETRIC_BOARD, X_TRUE, Scene, write_session
 from tests.codes import raises
 
 SolveSet = Callable[[Path], SolvedRecording]

@@ -159,11 +159,7 @@ async def test_a_daemon_that_hangs_is_not_believed(tmp_path: Path) -> None:
     hung = Station(tmp_path / "c.sock")
     hung.server.start()  # and nobody reads
     assert stop(hung.control)[0] is Outcome.SILENT
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link, pytest.raises(BlockingIOError):
-        while link.sendto(b"x", socket.MSG_DONTWAIT, str(stop_socket(hung.control))):
-            pass
-    assert send_stop(hung.control) is None  # the queue is full of STOPs
-    assert stop(hung.control)[0] is Outcome.SILENT
+    assert {send_stop(hung.control) for _ in range(5000)} == {None}  # a queue full of STOPs is one
     hung.server.close()
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrate.imported.board import FEWEST, GUESSED_M, Key, Seen, see_board, told_boards
 from calibrate.imported.mounting import joints_of, joints_rad, mounting
-from calibrate.imported.readings import Reading, decide, is_good, readings
+from calibrate.imported.table_readings import TableReading, decide, is_good, table_readings
 from recordings.errors import ImportSourceError
 from recordings.importers.conventions import NAMED, Convention, convention
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
@@ -74,7 +74,7 @@ def believe(
         if (board.whose == "board" or (lies.told and board in unnamed)) and board not in robots
         if len(pairs := _pairs(robot, board)) >= FEWEST
     ]
-    tried: list[Reading] = []
+    tried: list[TableReading] = []
     families: list[str] = []
     seen: Seen | None = None
     for family in sorted(lies.images, key=lambda name: (bool(_MADE.search(name)), name)):
@@ -86,13 +86,13 @@ def believe(
         images = sorted((path for path in paths if isinstance(path, Path)), key=natural)
         if (seen := see_board(lies, given.board, images, progress)) is not None:
             for table, pairs in paired:
-                tried += readings(table, family, pairs, [seen], given.convention)
+                tried += table_readings(table, family, pairs, [seen], given.convention)
         if any(map(is_good, tried)):
             break
     else:
         for n, (robot, board, pairs) in enumerate(boards):
             progress(n, len(boards), "comparing tables of poses")
-            tried += readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
+            tried += table_readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
     if not tried and (seen or not families):
         there = [f"{len(paths)} {name}" for name, paths in lies.images.items()]
         tables = [f"{len(table.numbers)} {table.name}" for table in lies.tables]
@@ -138,7 +138,7 @@ def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
     return shared if unique and len(shared) > 0.8 * max(len(rows), len(paths)) else {}
 
 
-def _believed(lies: Lies, given: Given, best: Reading) -> Believed:
+def _believed(lies: Lies, given: Given, best: TableReading) -> Believed:
     seen, pairs = best.seen, best.pairs
     joints, by_joints = joints_of(lies, best) or (None, None)
     # A maker's convention is the tool in the base; a spelt one tells the direction only if inverse.
@@ -172,7 +172,7 @@ def _believed(lies: Lies, given: Given, best: Reading) -> Believed:
     return Believed(dataset, _rows(lies, best.table, how, pairs, saw, joints), facts)
 
 
-def _board(best: Reading) -> tuple[BoardSpec, str]:
+def _board(best: TableReading) -> tuple[BoardSpec, str]:
     """(the board, how its size is known); where nothing tells the squares, the arm's motion does."""
     board = best.seen.board
     if best.seen.square_known:

@@ -16,8 +16,8 @@ import numpy as np
 
 from calibrate.chain import learn_chain
 from calibrate.geometry import Array, inverse
-from calibrate.imported.readings import Reading
 from calibrate.imported.scenery import mount_by_scene
+from calibrate.imported.table_readings import TableReading
 from recordings.errors import ImportSourceError
 from recordings.importers.tables import Lies, Table
 from recordings.schema.messages import Mount
@@ -48,7 +48,7 @@ _CAMERA_IN_BOARD = re.compile(r"cam\w*?_?(2|to|in|wrt)_?(board|target|marker|obj
 
 
 def mounting(
-    lies: Lies, given: Mount | None, best: Reading, as_told: bool, by_joints: bool | None
+    lies: Lies, given: Mount | None, best: TableReading, as_told: bool, by_joints: bool | None
 ) -> tuple[Mount, bool, bool, str]:
     """(mounting, whether the robot's poses are inverted, whether the board's are, why).
 
@@ -87,7 +87,7 @@ def mounting(
     return mount, mount != fits, turned_board, by
 
 
-def _inverted_by_distances(best: Reading) -> tuple[bool | None, str]:
+def _inverted_by_distances(best: TableReading) -> tuple[bool | None, str]:
     """(whether the poses, inverted, place what the arm carries nearer to it than what stands; None: hard to
     tell, distances in words). An inverted pose exchanges flange and base."""
     X, Y = (float(np.linalg.norm(T[0, :3, 3])) for T in (best.fit.X, best.fit.Y))
@@ -98,7 +98,7 @@ def _inverted_by_distances(best: Reading) -> tuple[bool | None, str]:
     return (carried > stands if clear else None), f"{near:.2f} m from the flange, {far:.2f} m from the base"
 
 
-def joints_of(lies: Lies, best: Reading) -> tuple[Table, bool] | None:
+def joints_of(lies: Lies, best: TableReading) -> tuple[Table, bool] | None:
     """(table of the arm's joints, whether they move axes as the inverses of the poses do); None: none tells.
 
     An arm's flange is a product of turns in the order of its joints; of its inverse the order is reversed.

@@ -1,4 +1,7 @@
-"""Ways to read robot poses, each fitted to where the board was: the evidence decides."""
+"""Ways to read a table of numbers as robot poses, each fitted to where the board was: the evidence decides.
+
+They come before there is a recording. What `handeye.readings` tries are mistakes in a recording.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from calibrate.geometry import Array, inverse, rotation_angle, rotation_log, tra
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.pose_fit import FREE, PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.readings import clear_gain, explain_recording, explain_text
-from calibrate.handeye.solution import Reading as NamedReading
+from calibrate.handeye.solution import Reading
 from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates
 from calibrate.views import ViewSet
@@ -33,8 +36,8 @@ _STAYS_M, _STAYS_RAD = 0.015, 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
-    """One way to read a folder, and how well the board agrees."""
+class TableReading:
+    """One way to read a table of a folder, and how well the board agrees."""
 
     table: Table
     convention: Convention
@@ -56,9 +59,9 @@ class Reading:
         return f"{self.table.name}: {self.mount}, {self.convention.name}"
 
 
-def readings(
+def table_readings(
     table: Table, family: str, pairs: dict[Key, int], seens: list[Seen], named: str | None
-) -> Iterator[Reading]:
+) -> Iterator[TableReading]:
     """Yield the best readings that the views can judge; `named`: the convention that the user gives, beside
     which the others are tried all the same."""
     asked = None if named is None else convention(named)
@@ -81,7 +84,7 @@ def readings(
     for _, how, evidence, flange, seen, keys, mount in as_told + others:
         fitted = _fitted(seen, keys, flange, mount)
         if fitted is not None:
-            yield Reading(table, how, family, pairs, seen, mount, *fitted, evidence)
+            yield TableReading(table, how, family, pairs, seen, mount, *fitted, evidence)
 
 
 def _moves(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> float:
@@ -139,7 +142,7 @@ def _pose_views(views: ViewSet, seen: Seen) -> PoseViews:
     return pose_views(views, 0.02, 0.003 if seen.square_known else FREE)
 
 
-def is_good(reading: Reading) -> bool:
+def is_good(reading: TableReading) -> bool:
     X, factor = reading.fit.X[0], float(reading.fit.factors[0])
     itself = np.linalg.norm(X[:3, 3]) < 1e-3 and rotation_angle(X[:3, :3]) < 0.01
     return (
@@ -152,7 +155,7 @@ def is_good(reading: Reading) -> bool:
     )
 
 
-def decide(lies: Lies, readings: list[Reading], named: str | None, mount: Mount | None) -> Reading:
+def decide(lies: Lies, readings: list[TableReading], named: str | None, mount: Mount | None) -> TableReading:
     """The reading that is clearly best. What the user names is refused where another one is clearly better;
     whose mounting and convention are told needs not agree well: the solve judges it."""
     ranked = sorted(readings, key=lambda r: (not is_good(r), -r.fit.log_evidence))
@@ -175,11 +178,11 @@ def decide(lies: Lies, readings: list[Reading], named: str | None, mount: Mount 
     return best
 
 
-def _beats(one: Reading, other: Reading) -> bool:
+def _beats(one: TableReading, other: TableReading) -> bool:
     return one.fit.log_evidence - other.fit.log_evidence > clear_gain(len(one.fit.full))
 
 
-def _nearest(readings: list[Reading]) -> dict[str, Any]:
+def _nearest(readings: list[TableReading]) -> dict[str, Any]:
     """The reading nearest to right, and what would make it right, as a solve names it."""
     explained = [explain_recording(_pose_views(reading.views, reading.seen)) for reading in readings]
     gains = [found.log_evidence_gain if found.reading in _CAUSES else 0.0 for found in explained]
@@ -191,11 +194,11 @@ def _nearest(readings: list[Reading]) -> dict[str, Any]:
     return {**near, "cause": cause, "text": text}
 
 
-_CAUSES = (NamedReading.SHIFTED, NamedReading.MIRRORED, NamedReading.BOARD_MOVED, NamedReading.CAMERA_MOVED)
+_CAUSES = (Reading.SHIFTED, Reading.MIRRORED, Reading.BOARD_MOVED, Reading.CAMERA_MOVED)
 """What no convention of numbers mends."""
 
 
-def _same(one: Reading, other: Reading) -> bool:
+def _same(one: TableReading, other: TableReading) -> bool:
     """Tell whether two readings are the same poses, in other words; of boards perhaps told the other way."""
     a, b = (reading.convention.poses(reading.table.numbers) for reading in (one, other))
     if a.shape != b.shape or np.abs(a - b).max() > 1e-3:

@@ -110,7 +110,7 @@ class Daemon:
 
     def _speed_rad_s(self) -> float | None:
         try:
-            speeds = self.session.context.cell.robot.latest().joint_speeds_rad_s
+            speeds = self.session.context.cell.arm.latest().joint_speeds_rad_s
         except RobotError:
             return None
         return max(map(abs, speeds), default=None)

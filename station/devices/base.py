@@ -1,4 +1,17 @@
-"""Protocols that real, simulated and played-back devices implement, and the worker thread of a driver."""
+"""Protocols that real, simulated and played-back devices implement, and the worker thread of a driver.
+
+Where is the arm now? How late a state may be is the rule of `devices.news`.
+
+    await fresh(arm)    waits for a current state: whoever decides something by it
+    await ready(arm)    as `fresh`, and the arm is one that may be captured: sessions, by `ready_state`
+    arm.news()          does not wait, None while the state is late: loops that look again soon
+    arm.check()         as `news`, and may be captured: the loop that waits for rest
+    arm.latest()        does not wait, an error over 100 ms: to show it
+    arm.at(time)        the state at an image's exposure
+
+The driver of Universal Robots has two of its own: `newest`, which may be old, to judge a move that is watched
+by `news`, and `state_after`, for what happened after a moment.
+"""
 
 from __future__ import annotations
 
@@ -64,10 +77,7 @@ class Arm(Protocol):
     """True while a person moves the arm by hand: states may then be late by `MOVING_S` only."""
 
     def latest(self) -> RobotState:
-        """Return the newest state; StaleStateError when it is older than 100 ms.
-
-        For callers that poll. To decide something, wait for a current state by `fresh` or `ready`.
-        """
+        """Return the newest state; StaleStateError when it is older than 100 ms."""
 
     def news(self) -> RobotState | None:
         """Return the newest state; None while it is late. StaleStateError after `MOVING_S` in motion,
@@ -156,16 +166,16 @@ class Mover(Protocol):
 NEWS_POLL_S = 0.005
 
 
-async def fresh(robot: Arm) -> RobotState:
+async def fresh(arm: Arm) -> RobotState:
     """Wait for a current state of the arm and return it. StaleStateError when none comes."""
-    while (state := robot.news()) is None:
+    while (state := arm.news()) is None:
         await asyncio.sleep(NEWS_POLL_S)
     return state
 
 
-async def ready(robot: Arm) -> RobotState:
+async def ready(arm: Arm) -> RobotState:
     """Wait as `fresh` does; RobotError where nothing may be captured now (see `Arm.check`)."""
-    while (state := robot.check()) is None:
+    while (state := arm.check()) is None:
         await asyncio.sleep(NEWS_POLL_S)
     return state
 

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Cell:
     config: StationConfig
-    robot: Arm
+    arm: Arm
+    """What tells where the arm is. For a robot of Universal Robots `mover` is the same object."""
     camera: Camera
     source: Source
     """`real` only when both arm and camera are real."""
@@ -51,7 +52,7 @@ class Cell:
     def require_mover(self) -> Mover:
         """Return what moves the arm. RefusedError where a person does."""
         if self.mover is None:
-            raise RefusedError("moved-by-hand", robot=self.robot.identity.model)
+            raise RefusedError("moved-by-hand", robot=self.arm.identity.model)
         return self.mover
 
     async def stop(self, reason: str) -> None:
@@ -62,7 +63,7 @@ class Cell:
     @property
     def subject(self) -> ArmSubject:
         """Arm, firmware, payload and control path, to which an acceptance test is bound."""
-        mover, identity = self.require_mover(), self.robot.identity
+        mover, identity = self.require_mover(), self.arm.identity
         firmware = identity.controller_version
         return ArmSubject(
             self.source, identity.model, identity.serial, firmware, mover.payload, mover.control_path
@@ -72,7 +73,7 @@ class Cell:
         """Say why a real arm's stops are not accepted; empty: they are, or no real arm moves."""
         if self.mover is None or self.source != "real":
             return ""
-        if not self.robot.identity.serial or not self.mover.control_path:
+        if not self.arm.identity.serial or not self.mover.control_path:
             return ""
         speed_m_s = min(self.config.limits.speed_m_s, SPEED_CAP_M_S)
         return not_accepted(read_acceptance(root), self.subject, speed_m_s)

@@ -261,7 +261,7 @@ def playback_cell(recording: Path) -> Cell:
     )
     return Cell(
         config=config,
-        robot=robot,
+        arm=robot,
         mover=robot,
         camera=PlaybackCamera(robot),
         source="playback",

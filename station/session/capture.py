@@ -44,7 +44,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     """
     _phase(context, index, StationState.SETTLING, "settling")
     async with ImageWatch(context, index) as watch:
-        still = await context.stillness.settle(context.cell.robot.check, watch.look)
+        still = await context.stillness.settle(context.cell.arm.check, watch.look)
     _phase(context, index, StationState.CAPTURING, "capturing")
     image = context.require_recording().number(await take_image(context, index))
     state, bound_s = await at_exposure(context, image)
@@ -58,7 +58,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
         index=index,
         name=context.loaded().pose(index).name,
         picture_sequence=image.sequence,
-        base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
+        base_from_flange=matrix4(flange_pose(state, context.cell.arm.identity.tcp_offset)),
         joints_rad=state.joints_rad or None,
         attempt=attempt,
         stamps=stamps,
@@ -100,18 +100,18 @@ async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState
     """
     if image.time is None:
         raise PoseFailedError("no-time")
-    robot, deadline_s = context.cell.robot, time.monotonic() + RESTING_S
+    arm, deadline_s = context.cell.arm, time.monotonic() + RESTING_S
     while True:
         try:
-            state = robot.at(image.time.host_monotonic_ns)
+            state = arm.at(image.time.host_monotonic_ns)
             break
         except StaleStateError:
             if time.monotonic() > deadline_s:
                 raise
             await asyncio.sleep(0.01)
-    await context.arm()
+    await context.ready_state()
     context.stillness.require_rest(state)
-    clock = robot.clock()
+    clock = arm.clock()
     bound_s = image.time.bound_s + (clock.bound_s if clock else 0.0)
     if bound_s > (limit_s := context.cell.config.capture.time_bound_s):
         no_clock = image.time.source == "arrival"

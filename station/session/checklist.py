@@ -38,14 +38,14 @@ async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[C
 
 
 async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> list[Check]:
-    robot, host = context.cell.robot, context.cell.config.robot.host
+    arm, host = context.cell.arm, context.cell.config.robot.host
     try:
-        state = robot.latest()
+        state = arm.latest()
     except RobotError as error:
         told = context.cell.mover is None  # its error says it all
         remedy = "" if told else "check that it is on, its network cable, and robot.host"
         return [Check("robot", "failed", troubles.get("robot", str(error)), remedy)]
-    identity, condition = robot.identity, robot.condition(state)
+    identity, condition = arm.identity, arm.condition(state)
     if (mover := context.cell.mover) is None:
         return [
             Check("robot", "ok", f"{identity.model} {identity.serial}".rstrip() + ": its pose is posted"),
@@ -159,7 +159,7 @@ def _calibration_check(context: SessionContext) -> Check:
             allow_simulated=True,
             camera=cell.config.camera.name,
             require_valid=False,
-            robot_serial=cell.robot.identity.serial,
+            robot_serial=cell.arm.identity.serial,
             camera_serial=cell.camera.identity.serial,
         )
     except CalibrationError as error:
@@ -189,12 +189,12 @@ def _disk_check(context: SessionContext) -> Check:
 
 def _clock_check(context: SessionContext) -> Check:
     """Check the clocks: `ok` when both are known and their bounds together within the limit for poses."""
-    robot, frames = context.cell.robot.clock(), context.cell.camera.timing
-    if robot is None or frames is None:
-        known = "controller" if robot is not None else "camera" if frames is not None else "neither"
+    clock, frames = context.cell.arm.clock(), context.cell.camera.timing
+    if clock is None or frames is None:
+        known = "controller" if clock is not None else "camera" if frames is not None else "neither"
         return Check("clocks", "warning", f"known: {known}", "wait a few seconds and check again")
-    bound_s, limit_s = robot.bound_s + frames.bound_s, context.cell.config.capture.time_bound_s
-    text = f"controller ±{1000 * robot.bound_s:.2f} ms, frames ±{1000 * frames.bound_s:.2f} ms"
+    bound_s, limit_s = clock.bound_s + frames.bound_s, context.cell.config.capture.time_bound_s
+    text = f"controller ±{1000 * clock.bound_s:.2f} ms, frames ±{1000 * frames.bound_s:.2f} ms"
     if frames.impossible:
         text += f", {frames.impossible} impossible stamps"
         remedy = "the camera does not stamp the start of exposure: check its timestamp settings"

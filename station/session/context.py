@@ -78,9 +78,9 @@ class SessionContext:
         assert self.recording is not None
         return self.recording
 
-    async def arm(self) -> RobotState:
+    async def ready_state(self) -> RobotState:
         """Wait for a current state of an arm that may be captured, and return it. Raises RobotError."""
-        return await ready(self.cell.robot)
+        return await ready(self.cell.arm)
 
     @property
     def recorder(self) -> Recorder | None:

@@ -56,7 +56,7 @@ class DeviceConnector:
                 return
 
     async def _open_robot(self) -> None:
-        identity = await self._context.cell.robot.connect()
+        identity = await self._context.cell.arm.connect()
         self._found("robot", f"{identity.model} {identity.serial}")
 
     async def _open_camera(self) -> None:
@@ -79,7 +79,7 @@ class DeviceConnector:
 
         async def close_robot() -> None:
             with contextlib.suppress(RobotError):
-                await cell.robot.close()
+                await cell.arm.close()
 
         async def close_camera() -> None:
             with contextlib.suppress(CameraError):

@@ -78,7 +78,7 @@ class FreedriveCapture:
         """Tell the robot driver whether a person may move the arm, for its limits on late states."""
         state = self._context.store.state
         if state not in (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING):
-            self._context.cell.robot.guided = state is StationState.FREE_DRIVE
+            self._context.cell.arm.guided = state is StationState.FREE_DRIVE
 
     async def begin(self, check: bool = False) -> None:
         """Begin freedrive; open a recording if none is open, of a drift check where `check`."""
@@ -87,11 +87,11 @@ class FreedriveCapture:
         context, store = self._context, self._context.store
         if check and context.recording is not None:
             raise RefusedError("session-open")
-        await context.arm()
+        await context.ready_state()
         await look_back(context)
         Freedrive.require(store.state)  # STOP may have come in between
         context.requests.halt = False
-        self.guide = HandGuide(context.cell.robot.latest, context.stillness, context.workers.call)
+        self.guide = HandGuide(context.cell.arm.latest, context.stillness, context.workers.call)
         # Enter the state at once: while the file is opened no motion is offered and no image begun.
         store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
         async with self._taking:
@@ -166,7 +166,7 @@ class FreedriveCapture:
     async def _record(self, asked: bool) -> int:
         context = self._context
         queue, store = context.loaded(), context.store
-        joints = (await fresh(context.cell.robot)).joints_rad
+        joints = (await fresh(context.cell.arm)).joints_rad
         Record.require(store.state)  # STOP, or the end of freedrive, may have come in between
         index = queue.add(
             PlannedPose(f"hand-{len(queue.statuses) + 1:02d}", joints, why="guided by hand", guided=True)

@@ -76,8 +76,8 @@ async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
         await DISK.run(require_free_space, context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
         raise RefusedError("disk-full", reason=str(full)) from None
-    arm = await context.arm()
-    start = vector6(arm.joints_rad)
+    state = await context.ready_state()
+    start = vector6(state.joints_rad)
     queue, poses = motion.queue, motion.poses
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
     check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
@@ -94,7 +94,7 @@ async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
         top_speed_m_s=round(check.top_speed_m_s, 3),
         duration_s=round(check.duration_s + overhead_s, 1),
         first_move=f"{_displacement(context, start, plan.poses[0].joints_rad)} to pose {poses[0] + 1}",
-        warnings=tuple(await _warnings(context, arm)),
+        warnings=tuple(await _warnings(context, state)),
         start_joints_rad=start,
         stop_test=motion.stop_test,
     )
@@ -151,9 +151,9 @@ def _purpose_words(context: SessionContext, motion: Motion) -> str:
     return f"continue session {context.recording.name}"
 
 
-async def _warnings(context: SessionContext, arm: RobotState) -> list[str]:
+async def _warnings(context: SessionContext, state: RobotState) -> list[str]:
     warnings = []
-    slider = arm.target_speed_fraction
+    slider = state.target_speed_fraction
     if slider < _SLOW_SLIDER:
         warnings.append(f"the speed slider stands at {100 * slider:.0f} %")
     if trouble := await DISK.run(context.cell.acceptance_trouble, context.root):

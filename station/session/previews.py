@@ -67,10 +67,10 @@ class Previewer:
         RobotError, WorkerError.
         """
         check_board(tag)
-        context, robot = self._context, self._context.cell.robot
+        context, arm = self._context, self._context.cell.arm
         async with self._taking:  # one at a time, so that a new session waits for one image at most
             _require_between_sessions(context)
-            await context.arm()
+            await context.ready_state()
             if not context.stillness.at_rest:
                 raise NotStillError("arm-moves")
             image = await context.cell.camera.capture(_OBSERVE_S)
@@ -82,10 +82,10 @@ class Previewer:
         return Observation(
             mount=context.cell.config.mount,
             source=context.cell.source,
-            robot_serial=robot.identity.serial,
+            robot_serial=arm.identity.serial,
             camera_serial=context.cell.camera.identity.serial,
-            base_from_flange=matrix4(flange_pose(state, robot.identity.tcp_offset)),
-            tcp_offset=robot.identity.tcp_offset,
+            base_from_flange=matrix4(flange_pose(state, arm.identity.tcp_offset)),
+            tcp_offset=arm.identity.tcp_offset,
             corners=tuple(found.indices.tolist()),
             pixels=tuple((float(u), float(v)) for u, v in found.pixels),
         )

@@ -153,7 +153,7 @@ class SessionRecording:
             source=self._cell.source,
             board=config.board,
             camera=self._session_camera(first_image),
-            robot=self._cell.robot.identity,
+            robot=self._cell.arm.identity,
             camera_identity=msgspec.structs.replace(self._cell.camera.identity, name=name),
             part=self.segment,
             created_wall_ns=time.time_ns(),
@@ -173,7 +173,7 @@ class SessionRecording:
         recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
         recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
         recorder.attach("camera.json", "application/json", msgspec.json.encode(settings))
-        if (kinematics := self._cell.robot.kinematics) is not None:
+        if (kinematics := self._cell.arm.kinematics) is not None:
             recorder.attach(ARM_KINEMATICS_NAME, "application/json", msgspec.json.encode(kinematics))
         for name, content in self._cell.attachments.items():
             recorder.attach(name, "application/json", content)

@@ -129,7 +129,7 @@ class Run:
                 # Save the poses before anything moves, so that a restart finds them.
                 await context.recording.save_state(self._queue)
             await self._mover.start_control()
-            here = (await fresh(context.cell.robot)).joints_rad  # starting control takes a second or two
+            here = (await fresh(context.cell.arm)).joints_rad  # starting control takes a second or two
             require_start(here, self._go.start_joints_rad, "while control was started")
             if self._records:
                 await self._open_recording()
@@ -158,7 +158,7 @@ class Run:
     async def _motion(self) -> None:
         """Drive what was approved, to the state that follows it."""
         if (test := self._go.motion.stop_test) is not None:
-            here = vector6((await self._context.arm()).joints_rad)
+            here = vector6((await self._context.ready_state()).joints_rad)
             move = self._drive(here, vector6(self._queue.pose(0).joints_rad), "stop test")
             await stop_half_way(self._context, test, here, move)
             return
@@ -210,7 +210,7 @@ class Run:
     async def _move_to(self, index: int) -> None:
         """Move to a pose from where the arm is. LimitError when the path is not free."""
         context, queue = self._context, self._queue
-        here, target = (vector6(at.joints_rad) for at in (await context.arm(), queue.pose(index)))
+        here, target = (vector6(at.joints_rad) for at in (await context.ready_state(), queue.pose(index)))
         queue.mark(index, "moving")
         context.store.enter(StationState.MOVING)
         context.show_poses(index)
@@ -224,7 +224,7 @@ class Run:
         check = await MOTION.run(check_path, self._geometry, here, target, name)
         if check.problems:
             raise LimitError("path", listed="; ".join(map(str, check.problems)))
-        now = (await self._context.arm()).joints_rad
+        now = (await self._context.ready_state()).joints_rad
         moved_rad = float(np.abs(np.subtract(now, here)).max())
         if moved_rad > JOGGED_RAD:  # less may be settling
             when = "while its path was checked"

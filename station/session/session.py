@@ -72,8 +72,8 @@ class Session:
         self._estimator = Estimator(self.context)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
-        cell.robot.subscribe(monitor.add)
-        cell.robot.subscribe(self.context.record_state)
+        cell.arm.subscribe(monitor.add)
+        cell.arm.subscribe(self.context.record_state)
         self.store.recorded = self.context.record_event
         self.store.watch(self._estimator.poke)
 
@@ -149,7 +149,7 @@ class Session:
         """Leave `stopped` or `fault` after a person looked at the cell."""
         self._require_state(verbs.Acknowledge)
         try:
-            await fresh(self.context.cell.robot)
+            await fresh(self.context.cell.arm)
             resting = self.context.resting
         except RobotError:
             resting = StationState.DISCONNECTED
@@ -195,7 +195,7 @@ class Session:
         """
         context = self.context
         self.permit(verbs.Go, client_id)
-        joints = (await fresh(context.cell.robot)).joints_rad
+        joints = (await fresh(context.cell.arm)).joints_rad
         self.permit(verbs.Go, client_id)
         self._require_run_ended()
         if self.freedrive.taking:
@@ -283,7 +283,7 @@ class Session:
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
         try:
-            start = (await fresh(self.context.cell.robot)).joints_rad
+            start = (await fresh(self.context.cell.arm)).joints_rad
         except RobotError:
             start = None
         self.store.event("planning", f"planning {poses} poses", poses=poses)

@@ -51,7 +51,7 @@ async def stop_motion(context: SessionContext, test: StopTest) -> Motion:
     """
     if context.recording is not None:
         raise RefusedError("session-open")
-    state = await context.arm()
+    state = await context.ready_state()
     if (fraction := state.target_speed_fraction) < _SLIDER_FULL:
         raise RefusedError("slider-low", fraction=fraction)
     plan = await MOTION.run(_free_move, context, test, vector6(state.joints_rad))
@@ -132,11 +132,11 @@ async def _give_stop(
     context: SessionContext, test: StopTestMove, start_rad: Vector6, driving: asyncio.Task[None]
 ) -> None:
     """Trigger the stop in mid-move and note its exact time. RobotError where the way is missing."""
-    robot = context.cell.robot
+    arm = context.cell.arm
     start, turn_rad = start_rad[test.joint], test.target_rad - start_rad[test.joint]
     while not driving.done():
         with contextlib.suppress(StaleStateError):  # the move itself reports states that are too old
-            if abs(robot.latest().joints_rad[test.joint] - start) >= _MIDDLE * abs(turn_rad):
+            if abs(arm.latest().joints_rad[test.joint] - start) >= _MIDDLE * abs(turn_rad):
                 break
         await asyncio.sleep(_LOOK_S)
     else:

@@ -45,7 +45,7 @@ class Monitor:
 
     def refresh(self) -> None:
         self._watch_files()
-        store, notice = self._context.store, self._context.cell.robot.notice
+        store, notice = self._context.store, self._context.cell.arm.notice
         if store.state is StationState.MOVING:
             store.update(reason=notice)  # such as 'speed slider at 5 %'
         store.update(
@@ -64,19 +64,19 @@ class Monitor:
         return FINISHES if context.requests.finish else PAUSES if context.requests.pause_by else ""
 
     def _robot(self) -> RobotStatus:
-        context, robot, mover = self._context, self._context.cell.robot, self._context.cell.mover
+        context, arm, mover = self._context, self._context.cell.arm, self._context.cell.mover
         shown = RobotStatus(
-            identity=robot.identity,
+            identity=arm.identity,
             remote=mover.remote if mover else None,
             control=mover is not None and mover.control,
             control_path=mover.control_path if mover else "",
             not_accepted=self._files.not_accepted,
             speed_limit_m_s=min(context.cell.config.limits.speed_m_s, SPEED_CAP_M_S),
             by_hand=mover is None,
-            notice=robot.notice,
+            notice=arm.notice,
         )
         try:
-            state = robot.latest()
+            state = arm.latest()
         except RobotError:
             return shown
         speed_m_s = 0.0
@@ -85,7 +85,7 @@ class Monitor:
         return msgspec.structs.replace(
             shown,
             state=state,
-            condition=robot.condition(state),
+            condition=arm.condition(state),
             speed_m_s=round(speed_m_s, 3),
             still=context.stillness.at_rest,
         )
@@ -187,9 +187,9 @@ class SessionSupervisor:
 
     def _watch_link(self) -> None:
         """Switch between idle and disconnected; during a run the run itself detects a lost robot."""
-        store, robot = self._context.store, self._context.cell.robot
+        store, arm = self._context.store, self._context.cell.arm
         try:
-            if robot.news() is None:
+            if arm.news() is None:
                 self._late_since_s = self._late_since_s or time.monotonic()
                 return
         except StaleStateError as error:
@@ -215,7 +215,7 @@ class SessionSupervisor:
     def _tell_delay(self, since_s: float) -> None:
         """Report what made states of a resting arm late."""
         store, now_s = self._context.store, time.monotonic()
-        late = self._context.cell.robot.delay(self.lag_ms() / 1000, since_s - TOLD_S)
+        late = self._context.cell.arm.delay(self.lag_ms() / 1000, since_s - TOLD_S)
         began_ns = time.time_ns() - round(1e9 * (now_s - since_s))
         told = any(event.code in set(Delay) and event.wall_ns > began_ns for event in store.status.events)
         if late is not None and now_s - since_s > TOLD_S - CURRENT_S and not told:

@@ -67,7 +67,7 @@ def simulated_cell(
     robot = UrRobot(config.robot, folder)
     return Cell(
         config=config,
-        robot=robot,
+        arm=robot,
         mover=robot,
         camera=camera,
         source="simulated",

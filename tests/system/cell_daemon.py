@@ -70,7 +70,7 @@ def main() -> None:
     arm = UrRobot(config.robot, place)
     cell = Cell(
         config=config,
-        robot=arm,
+        arm=arm,
         mover=arm,
         camera=(HangingCamera if hangs == "camera" else RenderedCamera)(truth, host, config.camera),
         source="simulated",

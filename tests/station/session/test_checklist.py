@@ -121,7 +121,7 @@ async def test_what_is_installed_is_of_this_robot_and_camera_and_holds(
         msgspec.structs.replace(
             device.identity, serial="another" if change == name else device.identity.serial
         )
-        for name, device in (("robot", cell.robot), ("camera", cell.camera))
+        for name, device in (("robot", cell.arm), ("camera", cell.camera))
     )
     write_calibration(calibration_of(make_cell(), robot, camera), tmp_path / "cell.yaml")
     install(tmp_path / "cell.yaml", root, cell="simulated")

@@ -27,9 +27,9 @@ from recordings.recover import Recovery
 from station.cell.config import StationConfig
 from station.cell.pose_plan import Plan
 from station.cell.status import StationStatus
-from station.cli.control import DoctorJson
 from station.cli.demo import DemoJson
 from station.cli.plan import PlanJson
+from station.cli.requests import DoctorJson
 from station.cli.session import SessionJson
 
 FOLDER = Path(__file__).resolve().parent / "schemas"

@@ -20,7 +20,7 @@ from station.cell.status import StationState
 from station.devices.base import Camera
 from station.devices.cell import Cell
 from station.devices.serial_trigger import SerialTrigger
-from station.server.control import ControlServer
+from station.server.connections import ClientServer
 from station.server.dispatch import SessionDispatcher
 from station.server.stop_server import StopServer
 from station.session.session import Session
@@ -65,7 +65,7 @@ class Daemon:
         """`told_to_end` is called when SIGTERM, SIGINT or `end` begins the shutdown."""
         self.session = Session(cell, root)
         dispatcher = SessionDispatcher(self.session)
-        self._control = ControlServer(control, dispatcher, newest=lambda: self.session.store.status)
+        self._client_server = ClientServer(control, dispatcher, newest=lambda: self.session.store.status)
         self._stop_server = StopServer(control, dispatcher.stop_by_datagram, self._latched, self._speed_rad_s)
         self.session.supervisor.first = self._stop_server.round
         self.session.supervisor.ticked = self._ping
@@ -81,7 +81,7 @@ class Daemon:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.end)
-        await self._control.start()
+        await self._client_server.start()
         try:
             self._stop_server.start()
             await self.session.start()
@@ -96,7 +96,7 @@ class Daemon:
             # The order matters: stop the arm, finish the recording, then tell the clients.
             await self.session.close()
             notify("STOPPING=1")
-            await self._control.close()
+            await self._client_server.close()
             self._stop_server.close()
             log.info("ended")
 
@@ -123,7 +123,7 @@ class Daemon:
                 async with asyncio.timeout(CONTROL_SERVED_S / 4):
                     await self._changed.wait()
             self._changed.clear()
-            self._control.publish(self.session.store.status)
+            self._client_server.publish(self.session.store.status)
             self._tell_systemd()
             await asyncio.sleep(GATHER_S)
 

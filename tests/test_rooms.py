@@ -104,7 +104,7 @@ READ_DIRECTLY = {
     "station/cell/process.py", "station/server/approval.py", "station/devices/discovery.py",
     "station/devices/aravis_device.py", "station/devices/posted.py",
     # files of the package
-    "station/cli/control.py", "station/simulation/controller/kinematics.py", "calibrate/report/html.py",
+    "station/cli/requests.py", "station/simulation/controller/kinematics.py", "calibrate/report/html.py",
     "station/tui/live_page.py",
     "station/simulation/controller/__main__.py",  # stands alone
 }  # fmt: skip

@@ -38,24 +38,24 @@ STATION = LazyGroup(
             ),
         ),
         "status": LazyCommand(
-            "station.cli.control:status_command", ("station status", "station status --json")
+            "station.cli.requests:status_command", ("station status", "station status --json")
         ),
         "post": LazyCommand(
             "station.cli.post:post_command",
             ("python tell_pose.py | station post", "station post --typed kuka-abc"),
             rare=True,
         ),
-        "stop": LazyCommand("station.cli.control:stop_command", ("station stop",)),
+        "stop": LazyCommand("station.cli.requests:stop_command", ("station stop",)),
         "acknowledge": LazyCommand(
-            "station.cli.control:acknowledge_command", ("station acknowledge",), rare=True
+            "station.cli.requests:acknowledge_command", ("station acknowledge",), rare=True
         ),
-        "pause": LazyCommand("station.cli.control:pause_command", ("station pause",), rare=True),
+        "pause": LazyCommand("station.cli.requests:pause_command", ("station pause",), rare=True),
         "resume": LazyCommand("station.cli.session:resume_command", ("station resume",), rare=True),
-        "finish": LazyCommand("station.cli.control:finish_command", ("station finish",), rare=True),
+        "finish": LazyCommand("station.cli.requests:finish_command", ("station finish",), rare=True),
         "retake": LazyCommand(
-            "station.cli.control:retake_command", ("station retake 7  # then: station resume",), rare=True
+            "station.cli.requests:retake_command", ("station retake 7  # then: station resume",), rare=True
         ),
-        "skip": LazyCommand("station.cli.control:skip_command", ("station skip 7",), rare=True),
+        "skip": LazyCommand("station.cli.requests:skip_command", ("station skip 7",), rare=True),
         "drift-check": LazyCommand(
             "station.cli.session:drift_check_command",
             ("station drift-check", "station drift-check --poses 12"),
@@ -67,7 +67,7 @@ STATION = LazyGroup(
         ),
         "new": LazyCommand("station.cli.new:new_command", ("station new", "station new -o station.yaml")),
         "doctor": LazyCommand(
-            "station.cli.control:doctor_command",
+            "station.cli.requests:doctor_command",
             ("station doctor --example > station.yaml", "station doctor --config station.yaml"),
         ),
     },

@@ -177,7 +177,7 @@ class Release(Verb[Done], frozen=True):
 class Stop(Verb[Done], frozen=True):
     """Stop the arm now, from any client.
 
-    `server.control` carries it out before any limit and later line: `server.dispatch` has no case of it.
+    `server.connections` carries it out before any limit and later line: `server.dispatch` has no case of it.
     """
 
     control = False

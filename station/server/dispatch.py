@@ -20,7 +20,7 @@ _WHO_LIMIT = 60
 
 
 class SessionDispatcher:
-    """The session as the connections of `server.control` reach it."""
+    """The session as the connections of `server.connections` reach it."""
 
     def __init__(self, session: Session, see: Callable[[int], Process | None] = process) -> None:
         self._session, self._see = session, see

@@ -27,7 +27,7 @@ from station.cell.status import StationState
 from station.protocol.client import Client
 from station.server import dispatch
 from station.server.approval import ApprovalRule, Peer, Process, process
-from station.server.control import ControlServer
+from station.server.connections import ClientServer
 from station.server.dispatch import SessionDispatcher
 from station.session import checklist
 from tests.codes import raises
@@ -41,7 +41,7 @@ class Served:
     def __init__(self, rig: Rig, path: Path, see: See = process) -> None:
         self.rig, self.path = rig, path
         self.dispatcher = SessionDispatcher(rig.session, see)
-        self.control = ControlServer(path, self.dispatcher)
+        self.control = ClientServer(path, self.dispatcher)
 
     async def client(self) -> Client:
         return await Client(self.path, "tty1").open()

@@ -38,11 +38,11 @@ from station.protocol.stop_client import (
     write_page,
 )
 from station.server import stop_server
-from station.server.control import ControlServer
+from station.server.connections import ClientServer
 from station.server.stop_server import Peer, StopServer
 from tests.durability import full
 from tests.patience import PATIENCE_S, until
-from tests.station.server.test_control import RecordingHandler, raw
+from tests.station.server.test_connections import RecordingHandler, raw
 
 NOBODY = 65534
 ONLY_ROOT = pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
@@ -318,7 +318,7 @@ async def test_a_daemon_does_not_serve_where_others_may_write(tmp_path: Path) ->
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
     with pytest.raises(StationError):
-        await ControlServer(tmp_path / "open" / "c.sock", RecordingHandler()).start()
+        await ClientServer(tmp_path / "open" / "c.sock", RecordingHandler()).start()
 
 
 def test_a_new_folder_is_this_users_alone(tmp_path: Path) -> None:
@@ -376,7 +376,7 @@ async def test_a_disk_that_is_full_costs_the_confirmation_never_the_stop(
 
 async def test_one_user_s_connections_are_counted_and_stop_needs_none(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
-    control = ControlServer(tmp_path / "c.sock", RecordingHandler())
+    control = ClientServer(tmp_path / "c.sock", RecordingHandler())
     await control.start()
     station = Station(tmp_path / "c.sock")
     station.start()

@@ -17,7 +17,7 @@ from station.cell.pose_plan import Plan
 from station.cell.status import LeaseStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Skip
-from station.server.control import ControlServer
+from station.server.connections import ClientServer
 from station.server.dispatch import SessionDispatcher
 from station.session import device_connector, supervisor
 from station.session.recording import SessionRecording
@@ -151,7 +151,7 @@ async def test_finish_waits_for_what_is_being_written(rig: Rig, held_disk: HeldD
 
 @pytest.mark.parametrize("verb", ["stop", "release"])
 async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_path: Path, verb: str) -> None:
-    control = ControlServer(tmp_path / "s", SessionDispatcher(rig.session))
+    control = ClientServer(tmp_path / "s", SessionDispatcher(rig.session))
     await control.start()
     stop = rig.arm.stop
 
@@ -232,7 +232,7 @@ async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch
 async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> None:
     from station.protocol.client import Client
 
-    control = ControlServer(tmp_path / "s", SessionDispatcher(rig.session))
+    control = ClientServer(tmp_path / "s", SessionDispatcher(rig.session))
     await control.start()
     await rig.session.release(1)
     rig.session.context.queue = None

@@ -1,4 +1,4 @@
-"""Control socket: every member of the group may watch and STOP, the client that has control may command.
+"""Clients on the control socket: each of the group may watch and STOP, the one that has control may command.
 
 The server never waits for a slow, hostile or stuck client: its memory is bounded and it is disconnected.
 """
@@ -44,7 +44,7 @@ NEW_PER_S = 200
 """Most connections that one user may open within a second."""
 
 
-class ControlServer:
+class ClientServer:
     """Server of the control socket until `close`; `publish` sends changes of the status to watchers."""
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The small commands: state, STOP, pause, finish, retake, skip, doctor."""
+"""Commands that ask the daemon one thing: state, STOP, pause, finish, retake, skip, doctor."""
 
 from __future__ import annotations
 

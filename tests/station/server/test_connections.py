@@ -22,7 +22,7 @@ from station.protocol.client import Client, DaemonGoneError
 from station.protocol.messages import LINE_LIMIT_BYTES, Answer
 from station.protocol.verbs import Go
 from station.server.approval import Peer
-from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
+from station.server.connections import OPEN_REQUESTS_LIMIT, ClientServer
 from station.server.dispatch import SessionDispatcher
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
@@ -66,15 +66,15 @@ async def handler() -> RecordingHandler:
 
 
 @pytest.fixture
-async def server(tmp_path: Path, handler: RecordingHandler) -> AsyncIterator[tuple[ControlServer, Path]]:
+async def server(tmp_path: Path, handler: RecordingHandler) -> AsyncIterator[tuple[ClientServer, Path]]:
     path = tmp_path / "control.sock"
-    control = ControlServer(path, handler)
+    control = ClientServer(path, handler)
     await control.start()
     yield control, path
     await control.close()
 
 
-Served = tuple[ControlServer, Path]
+Served = tuple[ClientServer, Path]
 
 
 async def raw(path: Path, *lines: bytes) -> list[dict[str, Any]]:
@@ -132,7 +132,7 @@ async def test_who_was_answered_knows_what_came_of_it(tmp_path: Path) -> None:
                 state = StationState.CHECKING
             return await super().handle(peer, verb, msgspec.Raw(b'{"index": 0}'))
 
-    control = ControlServer(tmp_path / "s", Running(), lambda: StationStatus(state=state))
+    control = ClientServer(tmp_path / "s", Running(), lambda: StationStatus(state=state))
     await control.start()
     async with Client(tmp_path / "s") as client:
         assert (await anext(client.statuses())).state is StationState.IDLE
@@ -187,7 +187,9 @@ async def test_a_flood_of_lines_holds_up_neither_stop_nor_the_heartbeat(
 ) -> None:
     """Lines that lie there already are read without a pause: a quarter of a megabyte took a second."""
     answered: list[Answer] = []
-    monkeypatch.setattr("station.server.control._Connection.reply", lambda _, reply: answered.append(reply))
+    monkeypatch.setattr(
+        "station.server.connections._Connection.reply", lambda _, reply: answered.append(reply)
+    )
     _, path = server
     with socket.socket(socket.AF_UNIX) as flood, socket.socket(socket.AF_UNIX) as other:
         for link, lines in ((flood, b"\n" * 50_000), (other, b'{"id": 1, "verb": "stop"}\n')):
@@ -227,12 +229,12 @@ async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: R
 async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tmp_path: Path) -> None:
     _, path = server
     with raises("already-served", StationError):
-        await ControlServer(path, RecordingHandler()).start()
+        await ClientServer(path, RecordingHandler()).start()
     stale = tmp_path / "stale.sock"
     left_over = socket.socket(socket.AF_UNIX)
     left_over.bind(str(stale))
     left_over.close()
-    replacement = ControlServer(stale, RecordingHandler())
+    replacement = ClientServer(stale, RecordingHandler())
     await replacement.start()
     await replacement.close()
 

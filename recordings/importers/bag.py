@@ -32,6 +32,7 @@ from recordings.importers.messages import ImageMessage, Progress
 from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Standstill, StandstillLimits, find_stops, proposed_limits
 from recordings.schema.messages import CameraModel, Image, Joints, Matrix4, RobotState, Stamps, Vector6, View
+from recordings.schema.viewing import matrix_of
 from recordings.writer import RecordingWriter, derived_recording
 
 PAIR_WITHIN_S = 0.05
@@ -122,17 +123,18 @@ def _camera(described: Dataset, found: CameraModel | None, first: Pixels) -> Cam
 
 
 def _write_states(writer: RecordingWriter, chosen: Selection) -> None:
-    """Robot states of an arm of six joints; the tool's pose is the flange's, for nobody told of a tool."""
+    """Robot states of an arm of six joints, its tool as dataset.yaml tells it."""
     joints = chosen.joints
     if joints is None or joints.positions_rad.shape[1] != 6:
         return
     speeds = np.zeros_like(joints.positions_rad) if joints.speeds_rad_s is None else joints.speeds_rad_s
+    flange_from_tcp = matrix_of(writer.info.robot.tcp_offset)
     for stamp_ns, *told in zip(joints.stamps_ns.tolist(), joints.positions_rad, speeds, strict=True):
-        T = chosen.track.at(np.array([stamp_ns]))[0]
+        T = chosen.track.at(np.array([stamp_ns]))[0] @ flange_from_tcp
         pose = [*T[:3, 3].tolist(), *cv2.Rodrigues(T[:3, :3])[0].ravel().tolist()]
         at, moving, tcp_pose = (msgspec.convert(list(map(float, six)), Vector6) for six in (*told, pose))
         state = RobotState(
-            stamps=Stamps(host_wall_ns=stamp_ns, controller_s=stamp_ns / 1e9),
+            stamps=Stamps(stamp_ns, stamp_ns, controller_s=stamp_ns / 1e9),
             joints_rad=at,
             joint_speeds_rad_s=moving,
             target_joints_rad=at,
@@ -145,7 +147,7 @@ def _write_view(
     writer: RecordingWriter, index: int, stop: Standstill, message: ImageMessage, joints_rad: Joints | None
 ) -> None:
     pixels, encoded = _pixels(message, stop.place)
-    stamps = Stamps(host_wall_ns=stop.stamp_ns, device_ns=stop.stamp_ns)
+    stamps = Stamps(stop.stamp_ns, stop.stamp_ns, device_ns=stop.stamp_ns)
     pixel_format = pixel_format_of(pixels, message.encoding)
     image = Image(pixels, stamps, stop.place, index, pixel_format=pixel_format)
     writer.image(image, encoded)

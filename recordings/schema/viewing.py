@@ -105,16 +105,16 @@ def frame_transform(parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
 
 def base_from_flange(tcp_pose: Vector6, tcp_offset: Vector6) -> Matrix4:
     """The controller's tool pose without the tool: base_from_tcp and flange_from_tcp → base_from_flange."""
-    T = _matrix(tcp_pose) @ _tcp_from_flange(tcp_offset)
+    T = matrix_of(tcp_pose) @ _tcp_from_flange(tcp_offset)
     return tuple(map(tuple, T.tolist()))
 
 
 @cache
 def _tcp_from_flange(tcp_offset: Vector6) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.inv(_matrix(tcp_offset)), np.float64)
+    return np.asarray(np.linalg.inv(matrix_of(tcp_offset)), np.float64)
 
 
-def _matrix(pose: Vector6) -> NDArray[np.float64]:
+def matrix_of(pose: Vector6) -> NDArray[np.float64]:
     """Position and rotation vector → 4×4."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(np.array(pose[3:]))[0], pose[:3]

@@ -18,6 +18,7 @@ from recordings.importers.messages import ros_types
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import JOINT_SPEED_RAD_S, LEAST_SAMPLES, StandstillLimits
 from recordings.reader import open_recording
+from recordings.schema.viewing import base_from_flange
 from station.cell.config import StillnessConfig
 from station.cell.stillness import LEAST_SAMPLES as STATION_LEAST_SAMPLES
 from tests.command_line import call
@@ -124,6 +125,18 @@ def test_the_stops_come_with_their_picture_and_the_right_pose(
         assert states[0].joints_rad == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (
             "base first, whatever order they came in"
         )
+
+
+def test_states_hold_the_tool_that_is_told_and_the_time_of_the_images(tmp_path: Path) -> None:
+    offset = (0.0, 0.0, 0.2, 0.1, 0.0, 0.0)
+    told = tmp_path / "told.yaml"
+    told.write_text(f"{DESCRIPTION}robot: {{model: UR10, tcp_offset: {list(offset)}}}\n")
+    import_bag(ros(tmp_path), tmp_path / "out.mcap", told)
+    recording = open_recording(tmp_path / "out.mcap")
+    samples, view = recording.robot_samples(), recording.views()[2]
+    state = np.searchsorted(samples.stamps_ns, view.stamps.host_monotonic_ns)
+    flange = base_from_flange(tuple(samples.tcp_pose[state].tolist()), offset)
+    np.testing.assert_allclose(flange, view.base_from_flange, atol=1e-9)
 
 
 @pytest.mark.parametrize("encoding", ["bayer_grbg8", "bayer_grbg8; png compressed "])

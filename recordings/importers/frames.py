@@ -17,11 +17,15 @@ from recordings.importers.messages import Array, FrameMessage
 SAMPLES_LIMIT = 4_000_000
 """Limit over all frames together: 64 bytes each."""
 KNOWN_PAIRS = (
-    ("base", "flange"), ("base", "tool0_controller"), ("base", "tool0"), ("base_link", "flange"),
-    ("base_link", "tool0"), ("base_link", "ee_link"), ("base_link", "wrist_3_link"),
-    ("panda_link0", "panda_link8"), ("fr3_link0", "fr3_link8"), ("world", "flange"), ("world", "tool0"),
+    ("base", "tool0"), ("base_link", "tool0"), ("base", "flange"), ("base_link", "flange"),
+    ("base_link", "ee_link"), ("base_link", "wrist_3_link"), ("panda_link0", "panda_link8"),
+    ("fr3_link0", "fr3_link8"), ("world", "tool0"), ("world", "flange"), ("base", "tool0_controller"),
 )  # fmt: skip
-"""(base, flange) as robots' drivers name them, best first."""
+"""(base, flange) as robots' drivers name them, best first.
+
+`tool0` is the controller's flange, against which ROS's `flange` is turned. `tool0_controller` of a UR is its
+TCP, which holds the pendant's tool.
+"""
 _UNIT_TOLERANCE = 0.01
 
 

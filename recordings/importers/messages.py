@@ -68,7 +68,14 @@ class FrameMessage:
     rotation_xyzw: tuple[float, float, float, float]
 
 
-Value = ImageMessage | CameraModel | JointMessage | list[FrameMessage]
+@dataclass(frozen=True)
+class CameraMessage:
+    raw: CameraModel
+    rectified: CameraModel
+    """Lens of the images from which a program took this distortion."""
+
+
+Value = ImageMessage | CameraMessage | JointMessage | list[FrameMessage]
 
 
 _KINDS = {
@@ -89,12 +96,14 @@ _KINDS = {
 }
 _NS = 1_000_000_000
 _LENS_MODELS: dict[str, Any] = {
+    "plumb_bob": "plumb_bob",
+    "brown_conrady": "plumb_bob",
     "kannala_brandt": "equidistant",
     "equidistant": "equidistant",
     "fisheye": "equidistant",
     "rational_polynomial": "rational_polynomial",
 }
-"""Names of ROS and foxglove → ours; others are plumb_bob."""
+"""Names of ROS and foxglove → ours; of others the numbers mean something else."""
 
 
 def kind_of(encoding: str, schema: str) -> Kind | None:
@@ -158,8 +167,10 @@ def _value(kind: Kind, message: Any, time_ns: int) -> Value:
         frame = message.header.frame_id if hasattr(message, "header") else message.frame_id
         return [_frame(stamp_ns, frame or "base", "flange", message.pose.position, message.pose.orientation)]
     if kind is Kind.CAMERA:
-        K, D = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 2
-        return _lens(message.width, message.height, K, D, message.distortion_model)
+        K, D, P = (getattr(message, name if hasattr(message, "K") else name.lower()) for name in "KDP")
+        size = message.width, message.height
+        straight = [number for place, number in enumerate(P) if place % 4 < 3]
+        return CameraMessage(_lens(*size, K, D, message.distortion_model), _lens(*size, straight, (), ""))
     if kind is Kind.JOINTS and hasattr(message, "joints"):
         joints = message.joints
         speeds = tuple(j.velocity for j in joints) if all(j.HasField("velocity") for j in joints) else ()
@@ -198,11 +209,11 @@ def _frame(stamp_ns: int, parent: str, child: str, at: Any, turn: Any) -> FrameM
 
 
 def _lens(width: int, height: int, K: Any, D: Any, distortion_model: str) -> CameraModel:
-    """Intrinsics; a K of zeros means that nobody knows them."""
+    """Intrinsics; a K of zeros, or a distortion of another model, means that they are not known."""
     k = np.array(K, float).ravel()
-    if len(k) != 9 or not k[0] > 0:
+    model: Any = _LENS_MODELS.get(distortion_model) if np.any(D) else "plumb_bob"
+    if len(k) != 9 or not k[0] > 0 or model is None:
         return CameraModel(width, height)
-    model = _LENS_MODELS.get(distortion_model, "plumb_bob")
     return CameraModel(
         width, height, tuple(map(tuple, k.reshape(3, 3).tolist())), tuple(map(float, D)), model
     )

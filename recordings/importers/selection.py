@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from array import array
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from recordings.errors import ImportSourceError
 from recordings.importers.bags import Bag, BagTopic
 from recordings.importers.frames import FrameTree, Track
-from recordings.importers.messages import Array, JointMessage, Kind
+from recordings.importers.messages import Array, CameraMessage, JointMessage, Kind
 from recordings.schema.messages import CameraModel, Joints
 
 _UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -105,23 +106,16 @@ def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> BagTopic:
 
 
 def _camera(bag: Bag, image: BagTopic) -> CameraModel | None:
-    """The calibration nearest to the image topic's name; its last message."""
-    cameras = _of(bag, Kind.CAMERA)
-    if not cameras:
-        return None
-
-    def common(topic: BagTopic) -> int:
-        pairs = zip(topic.name.split("/"), image.name.split("/"), strict=False)
-        return next((n for n, (a, b) in enumerate(pairs) if a != b), 99)
-
-    nearest = max(cameras, key=common)
-    if len(cameras) > 1 and common(nearest) <= 1:
+    """The lens by the innermost namespace that holds the image topic; its last message. None: none does."""
+    spaces = {topic.name: "".join(topic.name.rpartition("/")[:2]) for topic in _of(bag, Kind.CAMERA)}
+    around = [space for space in spaces.values() if image.name.startswith(space)]
+    inner = max(around, key=len, default="")
+    if around.count(inner) != 1:
         return None  # another camera's, for all that is known
-    last = None
-    for value in bag.values(nearest.name):
-        assert isinstance(value, CameraModel)
-        last = value
-    return last
+    (name,) = (name for name, space in spaces.items() if space == inner)
+    *_, last = bag.values(name)
+    assert isinstance(last, CameraMessage)
+    return last.rectified if re.search("(^|[_/])rect", image.name.removeprefix(inner)) else last.raw
 
 
 def _joints(bag: Bag) -> JointTrack | None:
@@ -134,29 +128,39 @@ def _joints(bag: Bag) -> JointTrack | None:
             assert isinstance(value, JointMessage)
             if order is None:
                 order, names = arm_joints(value.names), value.names
-            if order is None or value.names != names:
+            if order is None or value.names != names or len(value.positions_rad) != len(names):
+                continue
+            told_rad = [value.positions_rad[place] for place in order]
+            if not np.isfinite(told_rad).all():
                 continue
             stamps_ns.append(value.stamp_ns)
-            positions.extend(value.positions_rad[place] for place in order)
+            positions.extend(told_rad)
             if len(value.speeds_rad_s) == len(names):
                 speeds.extend(value.speeds_rad_s[place] for place in order)
-        if order is not None:
+        if order is not None and stamps_ns:
             by_time = np.argsort(stamps_ns, kind="stable")
             told, moved = (np.array(values).reshape(-1, len(order)) for values in (positions, speeds))
             track = np.array(stamps_ns)[by_time], told[by_time]
-            return JointTrack(topic.name, *track, moved[by_time] if len(moved) == len(told) else None)
+            known = len(moved) == len(told) and bool(np.isfinite(moved).all())
+            return JointTrack(topic.name, *track, moved[by_time] if known else None)
     return None
 
 
 def arm_joints(names: tuple[str, ...]) -> tuple[int, ...] | None:
-    """Places of the arm's joints, base first: by a UR driver's names, else five to seven beside fingers."""
+    """Places of the arm's joints, base first; None: not known.
+
+    By a UR driver's names, else by the numbers in the names of five to seven beside fingers.
+    """
     places = [[n for n, name in enumerate(names) if part in name] for part in _UR_ORDER]
     if all(len(found) == 1 for found in places):
         return tuple(found[0] for found in places)
-    arm = [n for n, name in enumerate(names) if not any(part in name.lower() for part in _HAND)]
-    if 5 <= len(arm) <= 7:
-        return tuple(sorted(arm, key=lambda n: names[n]) if len(set(names)) == len(names) else arm)
-    return None
+    numbers = {
+        n: tuple(map(int, re.findall(r"\d+", name)))
+        for n, name in enumerate(names)
+        if not any(part in name.lower() for part in _HAND)
+    }
+    ordered = len(set(numbers.values())) == len(numbers) and 5 <= len(numbers) <= 7
+    return tuple(sorted(numbers, key=numbers.__getitem__)) if ordered else None
 
 
 _HAND = ("finger", "gripper", "hand_")

@@ -1,0 +1,119 @@
+"""What is taken of a bag: the controller's own frames, the lens of these images, joints in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from scipy.spatial.transform import Rotation
+
+from recordings.importers.bags import BagTopic
+from recordings.importers.messages import FrameMessage, ImageMessage, JointMessage, Kind, decoded
+from recordings.importers.selection import Selection, Wanted, select
+
+STEPS = 20
+ARM = tuple(f"joint_{n}" for n in range(1, 7))
+
+
+def frame(stamp: int, parent: str, child: str, R: Rotation, at: tuple[float, float, float]) -> FrameMessage:
+    x, y, z, w = R.as_quat().tolist()
+    return FrameMessage(stamp, parent, child, at, (x, y, z, w))
+
+
+def ur_frames() -> list[list[FrameMessage]]:
+    """As ROS 2's ur_description has them, and a controller's frame with a tool of 0.2 m."""
+    fixed = [
+        frame(0, "base_link", "base", Rotation.from_euler("z", np.pi), (0, 0, 0)),
+        frame(
+            0, "wrist_3_link", "flange", Rotation.from_euler("xyz", [0, -np.pi / 2, -np.pi / 2]), (0, 0, 0)
+        ),
+        frame(0, "flange", "tool0", Rotation.from_euler("xyz", [90, 0, 90], True), (0, 0, 0)),
+    ]
+    moving = [
+        [
+            frame(n, "base_link", "wrist_3_link", Rotation.identity(), (-0.1 * n, 0, 0)),
+            frame(n, "base", "tool0_controller", Rotation.from_euler("z", np.pi), (0.1 * n, 0, 0.2)),
+        ]
+        for n in range(STEPS)
+    ]
+    return [fixed, *moving]
+
+
+def calibration(
+    model: str = "plumb_bob", D: Iterable[float] = (0.1, 0.2, 0, 0, 0), focal: float = 900
+) -> Any:
+    """A lens; the images rectified by it have another focal length and no distortion."""
+    K, P = [focal, 0, 15, 0, focal, 11, 0, 0, 1], [800, 0, 14, 0, 0, 800, 10, 0, 0, 0, 1, 0]
+    message = CameraCalibration(width=32, height=24, distortion_model=model, D=D, K=K, P=P)
+    return decoded("protobuf", "foxglove.CameraCalibration", message.SerializeToString(), 0, lambda *_: None)
+
+
+def chosen(image: str = "/cam/image_raw", **topics: list[Any]) -> Selection:
+    """What is taken of a bag with a UR, images on one topic, and more topics, their slashes as __."""
+    values: dict[str, tuple[Kind, list[Any]]] = {
+        image: (Kind.IMAGE, [ImageMessage(0, 32, 24, "mono8", 32, b"")]),
+        "/tf": (Kind.TRANSFORMS, ur_frames()),
+    }
+    for name, told in topics.items():
+        kind = Kind.JOINTS if isinstance(told[0], JointMessage) else Kind.CAMERA
+        values[name.replace("__", "/")] = kind, told
+    described = {n: BagTopic(n, kind, "cdr", "", len(told)) for n, (kind, told) in values.items()}
+    bag: Any = SimpleNamespace(topics=described, others=[], values=lambda name: iter(values[name][1]))
+    return select(bag, Wanted())
+
+
+def test_the_flange_of_a_ur_is_that_of_its_controller() -> None:
+    """ROS's `flange` is turned against it, `tool0_controller` holds the pendant's tool."""
+    T = chosen().track.at(np.array([3]))[0]
+    np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("z", np.pi).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(T[:3, 3], [0.3, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("image", ["/cam/image_rect", "/cam/image_rect_color/compressed"])
+def test_rectified_images_have_the_lens_without_distortion(image: str) -> None:
+    camera = chosen(image, __cam__camera_info=[calibration()]).camera
+    assert camera is not None and camera.matrix is not None
+    assert (camera.matrix[0], camera.distortion) == ((800, 0, 14), ())
+
+
+def test_a_lens_is_taken_from_the_images_own_namespace() -> None:
+    both = {"__rig__top__info": [calibration()], "__rig__left__info": [calibration(focal=700)]}
+    left = chosen("/rig/left/image_direct", **both).camera
+    assert left is not None and left.matrix is not None and left.matrix[0][0] == 700
+    assert chosen("/rig/right/image_raw", **both).camera is None
+    assert chosen("/wrist/image_raw", __ceiling__camera_info=[calibration()]).camera is None
+    root = chosen("/image_raw", __camera_info=[calibration()]).camera
+    assert root is not None and root.matrix is not None
+
+
+def test_a_lens_of_another_model_is_not_known() -> None:
+    camera = chosen(__cam__info=[calibration("fov", [0.9])]).camera
+    assert camera is not None and camera.matrix is None
+    straight = chosen(__cam__info=[calibration("", [])]).camera
+    assert straight is not None and straight.matrix is not None
+
+
+def joints(names: tuple[str, ...], *positions: tuple[float, ...]) -> list[JointMessage]:
+    return [JointMessage(n, names, q, (np.nan,) * len(q)) for n, q in enumerate(positions)]
+
+
+def test_joints_come_by_their_numbers() -> None:
+    names, q = (*ARM[::-1], "gripper"), (6.0, 5, 4, 3, 2, 1, 9)
+    track = chosen(__joints=joints(names, q)).joints
+    assert track is not None
+    np.testing.assert_array_equal(track.positions_rad, [[1, 2, 3, 4, 5, 6]])
+    assert track.speeds_rad_s is None, "no number is no speed"
+    unnumbered = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+    assert chosen(__joints=joints(unnumbered, (1, 2, 3, 4, 5))).joints is None, "nothing says their order"
+
+
+def test_reports_without_joints_are_passed_over() -> None:
+    good, nothing = (1.0, 2, 3, 4, 5, 6), (np.nan,) * 6
+    track = chosen(__joints=joints(ARM, (), nothing, good)).joints
+    assert track is not None
+    np.testing.assert_array_equal(track.positions_rad, [good])
+    assert chosen(__joints=joints(ARM, (), nothing)).joints is None

@@ -124,7 +124,7 @@ async def photograph(cameras: list[Camera], socket: Path) -> None:
         await camera.picture("motion")
         if camera is not cameras[-1]:
             await camera.pilot.press("escape")
-            await camera.app.desk.ask(verbs.Release())
+            await camera.app.link.ask(verbs.Release())
             await camera.pilot.pause(0.5)
     await cameras[-1].pilot.press("3", "tab", "enter")
     for camera in cameras:

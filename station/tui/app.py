@@ -28,7 +28,7 @@ from station.protocol.states import RUNNING
 from station.protocol.verbs import PreviewImage, Purpose
 from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
-from station.tui.desk import SILENT_S, Attendance, Desk, KnowingApp, StatusChanged
+from station.tui.daemon_link import SILENT_S, DaemonApp, DaemonLink, StatusChanged, TerminalWatch
 from station.tui.dialogs import Confirm, ConfirmMotion
 from station.tui.installed import Marks, marks, read_result, read_sessions, solved_file, state_root
 from station.tui.jobs import check_drift, solve_session
@@ -60,10 +60,10 @@ SCREENS: tuple[type[StationScreen], ...] = (
 )
 
 
-class StationApp(LivePageApp[None], KnowingApp):
+class StationApp(LivePageApp[None], DaemonApp):
     """One app, several screens; the same keys everywhere.
 
-    Screens are drawn from `known` alone. What they ask for goes to the daemon by `desk`.
+    Screens are drawn from `known` alone. What they ask for goes to the daemon by `daemon`.
     """
 
     TITLE = "Calibration station"
@@ -97,21 +97,21 @@ class StationApp(LivePageApp[None], KnowingApp):
 
     def __init__(self, client: Client) -> None:
         super().__init__()
-        self.desk = Desk(self, client)
-        self.attendance = Attendance(self.desk)
+        self.link = DaemonLink(self, client)
+        self.terminal_watch = TerminalWatch(self.link)
         self._look = asyncio.Event()
         self._marks: tuple[str, Marks] | None = None
         """The shown file, and marks of all below the root, when they were read."""
         self._greeted = False
 
     def on_mount(self) -> None:
-        self.run_worker(self.desk.follow(), group="follow", exit_on_error=False)
+        self.run_worker(self.link.follow(), group="follow", exit_on_error=False)
         self.fetch_previews()
         self.follow_disk()
-        self.attendance.begin()
+        self.terminal_watch.begin()
 
     def on_cursor_position(self, event: events.CursorPosition) -> None:
-        self.attendance.answered()
+        self.terminal_watch.answered()
 
     # --- what is known ---
 
@@ -122,7 +122,7 @@ class StationApp(LivePageApp[None], KnowingApp):
             await asyncio.sleep(PREVIEW_PERIOD_S)
             for preview in self.screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
-                    await preview.fetch(self.desk.client)
+                    await preview.fetch(self.link.client)
 
     @work(exclusive=True, group="live page", exit_on_error=False)
     async def action_open_live(self) -> None:
@@ -134,7 +134,7 @@ class StationApp(LivePageApp[None], KnowingApp):
             await asyncio.sleep(PREVIEW_PERIOD_S if self.known.works else LIVE_PERIOD_S)
             if page.watched:
                 with contextlib.suppress(OSError, StationError):
-                    picture = await self.desk.client.call(verbs.Preview(SIDE_PX, SIDE_PX), timeout_s=SILENT_S)
+                    picture = await self.link.client.call(verbs.Preview(SIDE_PX, SIDE_PX), timeout_s=SILENT_S)
                 page.publish(news_of(self.known, picture))
 
     def on_status_changed(self, message: StatusChanged) -> None:
@@ -151,7 +151,7 @@ class StationApp(LivePageApp[None], KnowingApp):
             self.bell()
         if not self._greeted:
             self._greeted = True
-            self.known = replace(self.known, configuration=self.desk.client.config)
+            self.known = replace(self.known, configuration=self.link.client.config)
             if status.state is StationState.DISCONNECTED and not status.playback:
                 self.switch_mode("connect")
             if not self.known.works:
@@ -159,7 +159,7 @@ class StationApp(LivePageApp[None], KnowingApp):
 
     @work(exclusive=True, group="checks", exit_on_error=False)
     async def action_look_at_checks(self) -> None:
-        if (checks := await self.desk.ask(verbs.Doctor())) is not None:
+        if (checks := await self.link.ask(verbs.Doctor())) is not None:
             self.known = replace(self.known, checks=tuple(checks))
 
     def watch_result_path(self) -> None:
@@ -181,7 +181,7 @@ class StationApp(LivePageApp[None], KnowingApp):
                 await self._read_changed(self.known.live.session)
 
     async def _read_changed(self, session: SessionStatus) -> None:
-        client, path = self.desk.client, self.result_path
+        client, path = self.link.client, self.result_path
         if not path and session.recording:
             path = await asyncio.to_thread(solved_file, session.folder)
         root = state_root(path) if path else client.root
@@ -198,27 +198,27 @@ class StationApp(LivePageApp[None], KnowingApp):
     async def action_solve_newest(self) -> None:
         session = self.known.shown.session
         if session.recording:
-            await solve_session(self.desk, session.recording, session.folder)
+            await solve_session(self.link, session.recording, session.folder)
         else:
             self.notify("Nothing is finished yet: F7 finishes a session; older ones are on 5.")
 
     @work(exclusive=True, group="drift", exit_on_error=False)
     async def action_drift_check(self) -> None:
-        await check_drift(self.desk, self.approves)
+        await check_drift(self.link, self.approves)
 
     # --- keys ---
 
     async def approves(self, preview: MotionPreview) -> bool:
         """Show the motion and ask; the arm moves after this question only."""
-        return await self.desk.question(ConfirmMotion(preview))
+        return await self.link.ask_person(ConfirmMotion(preview))
 
     async def plans_here(self, refusal: StationError) -> bool:
         """Offer to plan again from where the arm stands."""
-        return await self.desk.question(Confirm("Plan again from here?", refusal.text, yes="Plan"))
+        return await self.link.ask_person(Confirm("Plan again from here?", refusal.text, yes="Plan"))
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
-        await self.desk.stop()
+        await self.link.stop()
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_run(self) -> None:
@@ -226,19 +226,19 @@ class StationApp(LivePageApp[None], KnowingApp):
         status = self.known.live
         paused = status is not None and status.state is StationState.PAUSED
         unplanned = status is not None and not status.session.poses and not status.robot.by_hand
-        if unplanned and await self.desk.ask(NEW_PLAN, timeout_s=PREPARE_S) is None:
+        if unplanned and await self.link.ask(NEW_PLAN, timeout_s=PREPARE_S) is None:
             return
         wanted = Purpose.RESUME if paused else Purpose.RUN
         begun = prepared_motion(
-            self.desk.client, verbs.Prepare(wanted), self.approves, plans_here=self.plans_here
+            self.link.client, verbs.Prepare(wanted), self.approves, plans_here=self.plans_here
         )
-        if await self.desk.start(begun):
+        if await self.link.start(begun):
             await self.switch_mode("capture")
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_ask(self, verb: str) -> None:
         """Send a request that has no arguments, by its name."""
-        await self.desk.ask(verbs.VERBS[verb]())
+        await self.link.ask(verbs.VERBS[verb]())
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_finish(self) -> None:
@@ -248,8 +248,8 @@ class StationApp(LivePageApp[None], KnowingApp):
             return
         captured = f"{session.captured} of {len(session.poses)} poses are captured."
         body = f"{captured} The recording is closed; F9 then solves it."
-        if await self.desk.question(Confirm("Finish this session?", body, yes="Finish")):
-            await self.desk.ask(verbs.Finish())
+        if await self.link.ask_person(Confirm("Finish this session?", body, yes="Finish")):
+            await self.link.ask(verbs.Finish())
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_freedrive(self) -> None:
@@ -258,19 +258,19 @@ class StationApp(LivePageApp[None], KnowingApp):
             return
         begins = status.state is not StationState.FREE_DRIVE
         if status.guidance.outline and status.state in RUNNING:  # ends after the view that is being taken
-            await self.desk.ask(verbs.Pause())
-        elif await self.desk.ask(verbs.Freedrive(begins)) is not None and begins:
+            await self.link.ask(verbs.Pause())
+        elif await self.link.ask(verbs.Freedrive(begins)) is not None and begins:
             await self.switch_mode("capture")
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_acknowledge(self) -> None:
-        if await self.desk.ask(verbs.Acknowledge()) is not None:
+        if await self.link.ask(verbs.Acknowledge()) is not None:
             self.clear_notifications()  # what they said of the stop is over
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_leave(self) -> None:
-        held = self.known.works and self.desk.has_control()
-        if not held or await self.desk.question(Confirm("Close the screen?", HELD, yes="Close")):
+        held = self.known.works and self.link.has_control()
+        if not held or await self.link.ask_person(Confirm("Close the screen?", HELD, yes="Close")):
             self.exit()
 
     def get_key_display(self, binding: Binding) -> str:

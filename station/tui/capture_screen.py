@@ -13,7 +13,7 @@ from station.cell.status import StationState
 from station.protocol import verbs
 from station.protocol.states import LATCHED, RUNNING
 from station.tui.capture_panels import coverage_lines, error_lines, hand_lines, quality_line
-from station.tui.desk import KnowingApp
+from station.tui.daemon_link import DaemonApp
 from station.tui.frame import Line
 from station.tui.progress import LEGEND, progress_lines
 from station.tui.screen import Box, Panel, StationScreen
@@ -50,7 +50,7 @@ class CaptureScreen(StationScreen):
 
     def action_take_back(self) -> None:
         """Take back the last view that counts; only by hand."""
-        assert isinstance(self.app, KnowingApp)
+        assert isinstance(self.app, DaemonApp)
         status = self.app.known.shown
         counting = [pose.index for pose in status.session.poses if pose.counts]
         if status.state is StationState.FREE_DRIVE and counting:

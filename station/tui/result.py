@@ -236,4 +236,4 @@ class ResultScreen(StationScreen):
         if result is None or result.calibration is None:
             self.notify(f"There is no result to {what}: F9 on 5 makes one.")
         else:
-            await JOBS[what](self.desk, result, result.calibration)
+            await JOBS[what](self.link, result, result.calibration)

@@ -14,7 +14,7 @@ from textual.widgets import DataTable, Footer
 
 from station.protocol.client import ANSWER_S
 from station.protocol.verbs import Verb
-from station.tui.desk import Desk, KnowingApp
+from station.tui.daemon_link import DaemonApp, DaemonLink
 from station.tui.frame import Frame, Framed, Line
 from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
@@ -89,14 +89,14 @@ class StationScreen(Framed[None]):
     """Action of the app that reads what this screen shows."""
 
     @property
-    def desk(self) -> Desk:
+    def link(self) -> DaemonLink:
         """The daemon, as every screen asks it."""
-        assert isinstance(self.app, KnowingApp)
-        return self.app.desk
+        assert isinstance(self.app, DaemonApp)
+        return self.app.link
 
     def ask(self, verb: Verb[object], timeout_s: float = ANSWER_S) -> None:
         """Send a request to the daemon; a notice says why it was refused."""
-        self.run_worker(self.desk.ask(verb, timeout_s=timeout_s), group="command", exit_on_error=False)
+        self.run_worker(self.link.ask(verb, timeout_s=timeout_s), group="command", exit_on_error=False)
 
     def compose(self) -> ComposeResult:
         yield Frame(self.MODE.title(), self.MODE)

@@ -64,20 +64,20 @@ class SessionsScreen(StationScreen):
         if (kept := self._highlighted()) is None:
             self.notify(NO_SESSION)
             return
-        session, desk = kept.session, self.desk
+        session, link = kept.session, self.link
         match what:
             case "solve" if not session.sealed:
                 self.notify("This recording was never finished: press c to recover it first.")
             case "solve":
-                await solve_session(desk, session.recording, session.folder)
+                await solve_session(link, session.recording, session.folder)
             case "show" if not session.calibration:
                 self.notify("Not solved yet: F9 solves it.")
             case "show":
-                await desk.app.show_result(session.calibration)
+                await link.app.show_result(session.calibration)
             case "check":
-                await check_session(desk, session.recording, session.folder)
+                await check_session(link, session.recording, session.folder)
             case "recover":
-                await recover_session(desk, session.folder)
+                await recover_session(link, session.folder)
 
     def on_data_table_row_selected(self) -> None:
         """Show a session's result at Enter."""

@@ -17,7 +17,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch, touch_text
 from recordings.errors import CodedError
 from station.operate.tip_offsets import SeenBoard, note_touches, read_touch, see_board
-from station.tui.desk import Desk, told
+from station.tui.daemon_link import DaemonLink, told
 from station.tui.frame import Question
 from station.tui.installed import Result, state_root
 
@@ -69,13 +69,13 @@ class TouchCorners(Question[list[Touch]]):
         self.dismiss(list(self._found.values()))
 
 
-async def run_touch_test(desk: Desk, result: Result, _: Calibration) -> None:
+async def run_touch_test(link: DaemonLink, result: Result, _: Calibration) -> None:
     """Read corners until the person ends it, then write what was found into the file."""
     path = Path(result.path)
-    board = await desk.attempt(see_board(desk.client, path))
-    if board is None or not (touches := await desk.question(TouchCorners(board))):
+    board = await link.attempt(see_board(link.client, path))
+    if board is None or not (touches := await link.ask_person(TouchCorners(board))):
         return
-    words = await desk.attempt(asyncio.to_thread(note_touches, state_root(path), path, touches))
+    words = await link.attempt(asyncio.to_thread(note_touches, state_root(path), path, touches))
     if words:
-        desk.app.notify(words, markup=False)
-        await desk.app.show_result(result.path)
+        link.app.notify(words, markup=False)
+        await link.app.show_result(result.path)

@@ -17,7 +17,7 @@ from station.cell.status import CHECK_VIEWS, StationState, StationStatus
 from station.operate.drift_check import SEED
 from station.protocol import verbs
 from station.tui import jobs
-from station.tui.desk import REMEDIES, busy_words
+from station.tui.daemon_link import REMEDIES, busy_words
 from station.tui.dialogs import ConfirmMotion, JobScreen
 from station.tui.installed import read_installed
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, said, text_of, until

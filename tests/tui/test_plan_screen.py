@@ -9,7 +9,7 @@ from textual.widgets import DataTable
 
 from station.cell.status import PoseStatus
 from station.protocol import verbs
-from station.tui.desk import busy_words
+from station.tui.daemon_link import busy_words
 from station.tui.plan_screen import facts_line
 from station.tui.task import Known
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until

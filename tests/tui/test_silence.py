@@ -10,9 +10,9 @@ from textual.widgets import DataTable
 
 from station.cell.status import Event, StationState
 from station.protocol.client import Client, DaemonGoneError
-from station.tui import desk
+from station.tui import daemon_link
 from station.tui.capture_screen import CaptureScreen
-from station.tui.desk import STOP_UNHEARD
+from station.tui.daemon_link import STOP_UNHEARD
 from station.tui.task import SILENT
 from station.tui.widgets.preview import OLD, PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
@@ -20,8 +20,8 @@ from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said,
 
 @pytest.fixture(autouse=True)
 def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(desk, "LISTEN_S", 0.2)
-    monkeypatch.setattr(desk, "SILENT_S", 0.2)
+    monkeypatch.setattr(daemon_link, "LISTEN_S", 0.2)
+    monkeypatch.setattr(daemon_link, "SILENT_S", 0.2)
 
 
 async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_old(link: FakeLink) -> None:

@@ -32,23 +32,23 @@ class Clock:
         return self.now_s
 
 
-def offered(desk: ApprovalManager, client_id: int = 1) -> MotionApproval:
+def offered(manager: ApprovalManager, client_id: int = 1) -> MotionApproval:
     preview = MotionPreview(
         secrets.token_urlsafe(16), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
     )
     preview = msgspec.structs.replace(preview, start_joints_rad=HERE)
     motion = Motion(Purpose.RUN, PoseQueue(Plan("UR10", "eye-in-hand", ())), (0, 1, 2, 3))
-    desk.offer(MotionApproval(motion, preview, client_id))
-    assert desk.waiting is not None
-    return desk.waiting
+    manager.offer(MotionApproval(motion, preview, client_id))
+    assert manager.waiting is not None
+    return manager.waiting
 
 
 def test_a_go_is_for_one_use() -> None:
-    desk = ApprovalManager(Clock())
-    go = offered(desk)
-    assert desk.redeem(go.preview.token, 1, PLAN, HERE) == go
+    manager = ApprovalManager(Clock())
+    go = offered(manager)
+    assert manager.redeem(go.preview.token, 1, PLAN, HERE) == go
     with raises("approval-used"):
-        desk.redeem(go.preview.token, 1, PLAN, HERE)
+        manager.redeem(go.preview.token, 1, PLAN, HERE)
 
 
 @pytest.mark.parametrize(
@@ -65,26 +65,26 @@ def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
     change: dict[str, object], code: str
 ) -> None:
     clock = Clock()
-    desk = ApprovalManager(clock)
-    token = offered(desk).preview.token
+    manager = ApprovalManager(clock)
+    token = offered(manager).preview.token
     clock.now_s += float(change.get("later_s", 0))  # type: ignore[arg-type]
     with raises(code):
-        desk.redeem(
+        manager.redeem(
             change.get("token", token),  # type: ignore[arg-type]
             change.get("client_id", 1),  # type: ignore[arg-type]
             change.get("plan", PLAN),  # type: ignore[arg-type]
             change.get("joints", HERE),  # type: ignore[arg-type]
         )
     with pytest.raises(RefusedError):
-        desk.redeem(token, 1, PLAN, HERE)
+        manager.redeem(token, 1, PLAN, HERE)
 
 
 def test_a_newer_go_replaces_the_older_and_void_ends_both() -> None:
-    desk = ApprovalManager(Clock())
-    old, new = offered(desk), offered(desk)
+    manager = ApprovalManager(Clock())
+    old, new = offered(manager), offered(manager)
     assert old.preview.token != new.preview.token
-    desk.void()
-    assert desk.waiting is None
+    manager.void()
+    assert manager.waiting is None
     for go in (old, new):
         with pytest.raises(RefusedError):
-            desk.redeem(go.preview.token, 1, PLAN, HERE)
+            manager.redeem(go.preview.token, 1, PLAN, HERE)

@@ -7,7 +7,7 @@ from textual import events
 
 from station.cell.status import StationState
 from station.protocol import verbs
-from station.tui import desk
+from station.tui import daemon_link
 from tests.tui.conftest import FakeLink, app_on, commanded, said, text_of, until
 
 LOST = verbs.Release(silent=True)
@@ -30,22 +30,22 @@ async def test_who_commands_a_moving_arm_is_asked_for(
     answered: bool,
     lost: bool,
 ) -> None:
-    monkeypatch.setattr(desk, "ASK_S", 60.0)  # only the test asks
+    monkeypatch.setattr(daemon_link, "ASK_S", 60.0)  # only the test asks
     asked = []
-    monkeypatch.setattr(desk.Attendance, "ask", lambda seen: asked.append(seen))
+    monkeypatch.setattr(daemon_link.TerminalWatch, "ask", lambda seen: asked.append(seen))
     link.show(commanded(state, holder))
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
         for _ in range(2 * answered):  # an answer begins the count again
             app.post_message(events.CursorPosition(0, 0))
-            await until(pilot, lambda: app.attendance.unanswered == 0)
-            for _ in range(desk.UNANSWERED):
-                await app.attendance.look()
+            await until(pilot, lambda: app.terminal_watch.unanswered == 0)
+            for _ in range(daemon_link.UNANSWERED):
+                await app.terminal_watch.look()
             assert LOST not in link.asked
-        for _ in range(2 * desk.UNANSWERED):
-            await app.attendance.look()
+        for _ in range(2 * daemon_link.UNANSWERED):
+            await app.terminal_watch.look()
             await pilot.pause()
         assert (LOST in link.asked) is lost
         assert ("control released" in said(pilot)) is lost
-        assert len(asked) >= desk.UNANSWERED or not lost
+        assert len(asked) >= daemon_link.UNANSWERED or not lost

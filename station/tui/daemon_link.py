@@ -49,13 +49,13 @@ class StatusChanged(Message):
         self.status, self.why = status, why
 
 
-class KnowingApp(ThemedApp[None]):
-    """An app whose screens watch what is known, and ask the daemon by one desk."""
+class DaemonApp(ThemedApp[None]):
+    """An app whose screens are drawn from `known` and ask the daemon by one `link`."""
 
     known: reactive[Known] = reactive(Known(), repaint=False)
     result_path: reactive[str] = reactive("", repaint=False, always_update=True)
     """The calibration file that the result screen shows; empty: that of the session just captured."""
-    desk: Desk
+    link: DaemonLink
 
     async def show_result(self, calibration: str) -> None:
         """Open a calibration file."""
@@ -63,13 +63,13 @@ class KnowingApp(ThemedApp[None]):
         await self.switch_mode("result")
 
 
-class Desk:
-    """The screen's connection: kept open, listened to for silence, and every refusal a notice.
+class DaemonLink:
+    """The screen's way to the daemon: kept open, listened to for silence, and every refusal a notice.
 
     The daemon decides, nothing is decided here.
     """
 
-    def __init__(self, app: KnowingApp, client: Client) -> None:
+    def __init__(self, app: DaemonApp, client: Client) -> None:
         self.app, self.client = app, client
         client.guard = self._guard
 
@@ -164,8 +164,8 @@ class Desk:
         """Call a verb; a notice takes the place of an error."""
         return await self.attempt(self.client.call(verb, timeout_s=timeout_s))
 
-    async def question(self, screen: Screen[R]) -> R:
-        """Ask the person; only in a worker."""
+    async def ask_person(self, screen: Screen[R]) -> R:
+        """Ask by a window; only in a worker."""
         return await self.app.push_screen_wait(screen)
 
     async def start(self, begun: Awaitable[R]) -> R | None:
@@ -218,35 +218,35 @@ UNANSWERED = 5
 TERMINAL_SILENT = "The terminal did not answer for {:.0f} s: the arm was stopped and control released."
 
 
-class Attendance:
+class TerminalWatch:
     """Asks the terminal while the arm works by this screen; without answers it releases control."""
 
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
+    def __init__(self, link: DaemonLink) -> None:
+        self._link = link
         self.unanswered: int | None = None
         """Questions since the last answer; None: there never was one, so this terminal cannot answer."""
 
     def begin(self) -> None:
         self.ask()
-        self._desk.app.set_interval(ASK_S, self.look)
+        self._link.app.set_interval(ASK_S, self.look)
 
     def answered(self) -> None:
         self.unanswered = 0
 
     def ask(self) -> None:
-        if (driver := self._desk.app._driver) is not None:
+        if (driver := self._link.app._driver) is not None:
             driver.write(WHERE_IS_THE_CURSOR)
 
     async def look(self) -> None:
         if self.unanswered is None:
             return
-        if not self._desk.known.works or not self._desk.has_control():
+        if not self._link.known.works or not self._link.has_control():
             self.unanswered = 0
         elif self.unanswered < UNANSWERED:
             self.unanswered += 1
             self.ask()
         else:
-            await self._desk.ask(Release(silent=True))
+            await self._link.ask(Release(silent=True))
             self.unanswered = 0
             said = TERMINAL_SILENT.format(ASK_S * UNANSWERED)
-            self._desk.app.notify(said, severity="error", timeout=3600)
+            self._link.app.notify(said, severity="error", timeout=3600)

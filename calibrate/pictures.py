@@ -24,7 +24,7 @@ from calibrate.handeye.solve import solve_views
 from calibrate.imported import Given, believe, is_described
 from calibrate.job import single_threaded_opencv, with_board_poses
 from calibrate.solved import Solved
-from calibrate.views import BoardView, ViewSet, array_of
+from calibrate.views import BoardView, ViewSet, array_of, require_size
 from recordings.errors import ImportSourceError
 from recordings.files import usable_cores
 from recordings.importers import conventions
@@ -106,7 +106,8 @@ def _seen(given: ArrayLike | None, board: BoardSpec) -> _Seen:
     image = np.asarray(given)
     if image.ndim == 2 and image.shape[1] == 2:
         return _Seen(points, array_of(image, (len(points), 2), "corners"))
-    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
+    plain = image.ndim in (2, 3) and image.size and image.shape[2:] in ((), (3,), (4,))
+    if image.dtype not in (np.uint8, np.uint16) or not plain:
         shape = f"{image.shape} of {image.dtype}"
         raise BadViewsError("shape", what="a picture", given=shape, wanted="(h, w) or (h, w, 3) of uint8")
     found = detect(image, board, with_quality=False)
@@ -159,8 +160,10 @@ def solve(
         counted = f"the board is seen in {len(views)} of {len(seen)} pictures"
         advice = f"{Counter(without.values()).most_common(1)[0][0]}" if without else "Take 15 to 25."
         raise TooFewViewsError(counted=counted, views=len(views), needed=FEWEST_TO_SOLVE, advice=advice)
-    width, height = next((one.size for one in seen if one.size), (0, 0))
-    camera = camera or CameraModel(width, height)
+    camera = camera or CameraModel(*next((one.size for one in seen if one.size), (0, 0)))
+    for i, one in enumerate(seen):
+        if one.size is not None:
+            require_size(camera, one.size, i, f"picture {i}")
     found, intrinsics = with_board_poses(ViewSet(mount, views, camera, robot_model), board)
     options = replace(
         options or SolveOptions(),

@@ -94,8 +94,13 @@ def camera_matrix(camera: CameraModel) -> Array:
 
 
 def intrinsics_names(camera: CameraModel) -> tuple[str, ...]:
-    """Name the parameters of the camera's lens model, in the order of `intrinsics_vector`."""
-    return _PARAMETERS[camera.distortion_model]
+    """Name the parameters of the camera's lens model, in the order of `intrinsics_vector`.
+
+    A plumb_bob lens with more than five numbers, as OpenCV gives them, is rational.
+    """
+    model = camera.distortion_model
+    rational = model == "plumb_bob" and len(camera.distortion) > len(INTRINSICS) - 4
+    return _PARAMETERS["rational_polynomial" if rational else model]
 
 
 def intrinsics_vector(camera: CameraModel) -> Array:
@@ -173,7 +178,7 @@ def _by_intrinsics(camera: CameraModel, K: Array, x: Array, y: Array, xd: Array,
         tops = [(x * s, y * s) for s in (r2 / bottom, r2**2 / bottom)]
         tangential = [(2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y)]
         terms = [*tops, *tangential, (x * r2**3 / bottom, y * r2**3 / bottom)]
-        if camera.distortion_model == "rational_polynomial":
+        if "k6" in intrinsics_names(camera):
             terms += [(-x * s, -y * s) for s in (radial * r2**power / bottom for power in (1, 2, 3))]
     for place, (a, b) in enumerate(terms, start=4):
         J[..., 0, place] = K[0, 0] * a + K[0, 1] * b

@@ -17,7 +17,7 @@ from calibrate.geometry import pose, rotation_from_rpy
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.kinematics import MODELS, RobotModel, table_of_axes
 from calibrate.results import RejectedView
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import BoardView, ViewSet, require_size
 from recordings import strict_yaml
 from recordings.errors import BadImageError
 from recordings.files import usable_cores
@@ -225,15 +225,8 @@ def detect_all(
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
     picture = recording.image(view)
     height, width = picture.pixels.shape[:2]
-    if camera.width and (width, height) != (camera.width, camera.height):
-        raise BadViewsError(
-            "image-size",
-            view=view.index + 1,
-            name=view.name,
-            width_px=width,
-            height_px=height,
-            expected=f"{camera.width}×{camera.height}",
-        )
+    if camera.width:
+        require_size(camera, (width, height), view.index, view.name)
     return detect(viewable(picture.pixels, picture.pixel_format), spec, with_quality=False)
 
 

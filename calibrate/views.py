@@ -18,9 +18,9 @@ _NOMINAL_MATRIX = ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0))
 
 
 def array_of(values: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
-    """Take numbers of this shape, -1: any length. BadViewsError (`shape`) says what was given."""
+    """Copy numbers of this shape, -1: any length. BadViewsError (`shape`) says what was given."""
     try:
-        found = np.asarray(values, dtype=float)
+        found = np.array(values, dtype=float)
     except (TypeError, ValueError):
         found = np.zeros(())
     if not found.size:
@@ -33,6 +33,15 @@ def array_of(values: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
 
 def require_mount(mount: object) -> None:
     require_choice("mount", mount, get_args(Mount))
+
+
+def require_size(camera: CameraModel, size: tuple[int, int], index: int, name: str) -> None:
+    """Raise BadViewsError for an image of another size (width, height) than the camera's."""
+    if size != (camera.width, camera.height):
+        expected, (width, height) = f"{camera.width}×{camera.height}", size
+        raise BadViewsError(
+            "image-size", view=index + 1, name=name, width_px=width, height_px=height, expected=expected
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,9 @@ LENSES = {
         PAPER_CAMERA, distortion=(0.03, -0.01, 0.003, 0.0), distortion_model="equidistant"
     ),
 }
+LENSES["of eight numbers"] = msgspec.structs.replace(
+    LENSES["rational_polynomial"], distortion_model="plumb_bob"
+)
 
 
 def exact_motions(rng: np.random.Generator, views: int, X: Array) -> tuple[Array, Array]:

@@ -15,6 +15,7 @@ from calibrate.boards.detect import detect
 from calibrate.errors import CalibrationError
 from calibrate.job import SolvedRecording
 from calibrate.pictures import read_folder
+from calibrate.views import ViewSet
 from recordings.exporters.export import export_recording
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel
@@ -86,6 +87,13 @@ def test_robot_states_as_arrays_are_interpolated_to_the_images() -> None:
     np.testing.assert_allclose(joints, [view.joints_rad for view in views], atol=1e-4)
 
 
+def test_views_do_not_change_with_the_callers_arrays() -> None:
+    flanges = np.array([np.eye(4)] * 2)
+    views = ViewSet.from_poses("eye-in-hand", flanges, flanges)
+    flanges[:] = 0.0
+    np.testing.assert_array_equal(views.base_from_flange, [np.eye(4)] * 2)
+
+
 def test_poses_are_read_by_a_convention_and_a_board_as_typed(given: dict[str, Any]) -> None:
     poses, board = np.array(given["poses"]), given["board"]
     rows = np.hstack([poses[:, :3, 3] * 1e3, Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX", True)])
@@ -115,6 +123,8 @@ def test_corners_and_gaps_are_taken(given: dict[str, Any], solved: SolvedRecordi
     [
         ({"mount": "eye_in_hand"}, "choice"),
         ({"poses": np.zeros((3, 4))}, "shape"),
+        ({"camera": CameraModel(1280, 1024)}, "image-size"),
+        ({"images": [np.zeros((40, 60, 1), np.uint8)] * 2, "poses": [np.eye(4)] * 2}, "shape"),
         ({"joints_rad": np.zeros(4)}, "shape"),
         ({"images": [np.zeros((4, 4))] * 2, "poses": [np.eye(4)] * 2}, "shape"),
         (

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.projection import project
+from calibrate.projection import intrinsics_vector, project, with_intrinsics_vector
 from tests.calibrate.cells import LENSES
 
 
@@ -18,7 +18,9 @@ def test_pixels_are_opencvs(model):
     zero, K, d = np.zeros(3), np.array(camera.matrix), np.array(camera.distortion)
     function = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
     expected = function(points()[:, None], zero, zero, K, d)[0].reshape(-1, 2)
-    np.testing.assert_allclose(project(camera, points()).pixels, expected, atol=1e-9)
+    again = with_intrinsics_vector(camera, intrinsics_vector(camera))
+    for same in (camera, again):
+        np.testing.assert_allclose(project(same, points()).pixels, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("model", LENSES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import sys
 import tempfile
 from pathlib import Path
@@ -21,8 +22,8 @@ from station.cli.console import err
 from station.cli.daemon import ensure_daemon, own_daemon, require_none, tell_what_goes_on, user_config
 from station.devices.aravis import AravisCamera
 from station.devices.discovery import discover, discover_usb
-from station.devices.ur_dashboard import STOP
-from station.devices.ur_link import UrLink, not_connected
+from station.devices.ur_dashboard import STOP, STOPPED
+from station.devices.ur_link import UrLink
 from station.devices.ur_probe import identify, open_dashboard, unsupported_model
 from station.devices.webcam import WebcamCamera, discover_webcams
 from station.operate.draft import ArmReader, CameraChoice, CameraReader
@@ -38,9 +39,14 @@ class GuidedArm(UrLink):
             return str(problem)
 
     async def stop(self) -> None:
-        if self.dashboard is None:
-            raise not_connected(self.config.host)
-        await self.dashboard.ask(STOP)
+        said = ""
+        if self.dashboard is not None:
+            with contextlib.suppress(RobotError):
+                said = await self.dashboard.ask(STOP)
+        if said != STOPPED:  # the connection is dead, or of local control: it is refused in remote control too
+            said = await (await self.renew_dashboard()).ask(STOP)
+        if said != STOPPED:
+            raise RobotError("stop-refused", answer=said)
 
 
 _DRIVERS: dict[str, type[AravisCamera | WebcamCamera]] = {"aravis": AravisCamera, "webcam": WebcamCamera}

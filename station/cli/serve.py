@@ -10,6 +10,7 @@ import os
 import sys
 from dataclasses import replace
 from functools import partial
+from multiprocessing import util
 from pathlib import Path
 from typing import Annotated
 
@@ -114,6 +115,7 @@ async def serve_cell(
         cell.ended()
     logging.shutdown()
     sys.stdout.flush()
+    util._run_finalizers(0)  # `_exit` skips them: the worker's semaphores would be reported as leaked
     os._exit(0)
 
 

@@ -14,7 +14,8 @@ from collections import deque
 from station.cell.errors import RobotError
 
 PORT = 29999
-STOP = "stop"
+STOP, STOPPED = "stop", "Stopped"
+"""The command, and its answer where it was carried out."""
 ALLOWED = frozenset(
     {
         STOP, "PolyscopeVersion", "get serial number", "get robot model", "is in remote control",

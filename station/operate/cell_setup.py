@@ -77,17 +77,17 @@ class CellSetup:
         self._found(same, host=host, robot=robot)
 
     async def look_for_cameras(self) -> bool:
-        """Search for cameras; True when the list changed. A single one is opened at once."""
+        """Search for cameras; True when the list changed. A single one is opened, where none is yet."""
         found = await self._hardware.cameras()
         changed, self.cameras = found != self.cameras, found
-        if len(found) == 1:
+        if len(found) == 1 and self.camera is None:
             await self.open(found[0])
         return changed
 
-    async def open(self, chosen: CameraChoice) -> None:
-        """Show what this camera sees from now on, exposed well. Raises CameraError."""
+    async def open(self, chosen: CameraChoice) -> bool:
+        """Show what this camera sees from now on, exposed well; False: it was shown already. CameraError."""
         if self.draft.camera == chosen and self.camera is not None:
-            return
+            return False
         camera = await self._hardware.camera(chosen)
         await camera.expose(self.draft.exposure_us)
         image = await _exposed(camera)
@@ -97,6 +97,7 @@ class CellSetup:
         height, width = image.pixels.shape[:2]
         same, exposure_us = self.draft.camera == chosen, camera.exposure_us
         self._found(same, camera=chosen, width=width, height=height, exposure_us=exposure_us)
+        return True
 
     def _found(self, same: bool, **values: object) -> None:
         """Keep what a device tells; views of another device count no more."""

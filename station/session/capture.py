@@ -37,8 +37,10 @@ class PoseFailedError(StationError):
     code = "pose-failed"
 
 
-async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
+async def take_pose(context: SessionContext, index: int, attempt: int, unchecked: bool = True) -> None:
     """Wait until the arm is settled, take the image, write it, and mark the pose done.
+
+    `unchecked`: an image counts, too, in which the worker failed to look for the board: solving looks again.
 
     PoseFailedError and NotStillError when the pose failed; RobotError and RecordingError end the run.
     """
@@ -66,7 +68,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
         stillness=still,
     )
     _phase(context, index, StationState.WRITING, "writing")
-    await to_the_end(_write(context, index, image, view))
+    await to_the_end(_write(context, index, image, view, unchecked))
 
 
 def _phase(context: SessionContext, index: int, state: StationState, pose_state: PoseState) -> None:
@@ -120,12 +122,12 @@ async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState
     return state, bound_s
 
 
-async def _write(context: SessionContext, index: int, image: Image, view: View) -> None:
+async def _write(context: SessionContext, index: int, image: Image, view: View, unchecked: bool) -> None:
     """Write the image while the board is detected; write the view, and count the pose, only with a board."""
     recording, queue = context.require_recording(), context.loaded()
     recording.image(image)
     sighting = await _sighting(context, image, index)
-    unusable = _unusable(sighting) if sighting is not None else None
+    unusable = _unusable(sighting, unchecked)
     if sighting is not None and len(sighting.pixels):
         recording.require_open().corners(image.sequence, sighting.pixels)
     if unusable is not None:
@@ -147,7 +149,7 @@ async def _write(context: SessionContext, index: int, image: Image, view: View) 
 
 
 async def _sighting(context: SessionContext, image: Image, index: int) -> BoardDetection | None:
-    """Detect the board; None when the worker failed: the image is kept, and solving detects again."""
+    """Detect the board; None when the worker failed."""
     try:
         return await context.look_at(image)
     except WorkerError as error:
@@ -155,8 +157,10 @@ async def _sighting(context: SessionContext, image: Image, index: int) -> BoardD
         return None
 
 
-def _unusable(sighting: BoardDetection) -> PoseFailedError | None:
+def _unusable(sighting: BoardDetection | None, unchecked: bool) -> PoseFailedError | None:
     """Make the error where an image does not count; None when it does."""
+    if sighting is None:
+        return None if unchecked else PoseFailedError("not-checked")
     status = sighting.status
     if not status.found:
         return PoseFailedError("no-board", reason=status.reason or "No board in the image.", advice="")

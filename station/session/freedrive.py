@@ -173,7 +173,7 @@ class FreedriveCapture:
         )
         attempt = queue.start_attempt(index)
         try:
-            await take_pose(context, index, attempt)
+            await take_pose(context, index, attempt, unchecked=asked)
         except (PoseFailedError, NotStillError, StaleStateError) as error:  # late states: no move to stop
             if asked:
                 queue.mark(index, "failed", error)

@@ -67,24 +67,27 @@ class RenderedCamera:
 
     async def open(self) -> CameraIdentity:
         """Start the process and read its clock a few times."""
-        self.counter.restart()
         try:
             async with self._asking:  # so that images are taken only after the clock was read
-                await self._thread.run(self._start)
-                setup = (self._truth, self._host, self._exposure_us, self._gain_db)
-                await self._call(*setup, timeout_s=START_TIMEOUT_S)
-                self._clock.restart()  # not before: a clock without readings counts as unreadable
-                for _ in range(_CLOCK_READINGS):
-                    await self._read_clock()
+                await self._open()
         except BaseException:
             await self.close()
             raise
         return self.identity
 
+    async def _open(self) -> None:
+        self.counter.restart()
+        await self._thread.run(self._start)
+        setup = (self._truth, self._host, self._exposure_us, self._gain_db)
+        await self._call(*setup, timeout_s=START_TIMEOUT_S)
+        self._clock.restart()  # not before: a clock without readings counts as unreadable
+        for _ in range(_CLOCK_READINGS):
+            await self._read_clock()
+
     async def capture(self, timeout_s: float = 5.0) -> Image:
         """Trigger once and return that frame."""
         async with self._asking:
-            await self._place()
+            await self._ready()
             await self._read_clock()
             asked_ns = time.monotonic_ns()
             frame = await self._call("trigger", timeout_s=timeout_s)
@@ -103,7 +106,7 @@ class RenderedCamera:
     async def glimpse(self) -> Image:
         """Render a new image at half the size."""
         async with self._asking:
-            await self._place()
+            await self._ready()
             return _dated(await self._call("preview"))
 
     async def close(self) -> None:
@@ -112,8 +115,13 @@ class RenderedCamera:
             process.kill()  # ends a call that is under way, too
             await self._thread.close(ChildProcess(process).stop)
 
-    async def _place(self) -> None:
-        """Bring the camera to where a posted arm is now. CameraError where nothing is posted."""
+    async def _ready(self) -> None:
+        """Open it again when it was lost, as other drivers do, and bring it to where a posted arm is now.
+
+        CameraError where nothing is posted.
+        """
+        if self._process is not None and self._process.poll() is not None:
+            await self._open()
         if self._flange is None:
             return
         try:
@@ -136,6 +144,8 @@ class RenderedCamera:
     # -- in the camera's thread
 
     def _start(self) -> None:
+        if self._process is not None:
+            ChildProcess(self._process).stop()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "station.simulation.camera_process"],
             stdin=subprocess.PIPE,

@@ -238,6 +238,7 @@ ASKS: dict[str, type[Verb[Any]]] = {
     "freedrive": verbs.Freedrive,
     "ask('record')": verbs.Record,
     "take_back": verbs.Record,
+    "act('touch test')": verbs.Observe,
 }
 """Verb by the action of a key that asks the daemon for it."""
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
@@ -254,13 +255,17 @@ class Framed(Screen[R]):
 
     @property
     def active_bindings(self) -> dict[str, ActiveBinding]:
-        """All keys; the footer shows those that the daemon takes now, the others say why not when pressed."""
-        state, keys = self.known.shown.state, super().active_bindings
+        """All keys; the footer shows those that do something now, the others say why not when pressed."""
+        keys = super().active_bindings
         for key, active in keys.items():
-            verb = ASKS.get(active.binding.action)
-            if verb is not None and state not in verb.states:
+            if not self.does_something(active.binding.action):
                 keys[key] = active._replace(binding=replace(active.binding, show=False))
         return keys
+
+    def does_something(self, action: str) -> bool:
+        """Tell whether the action of a key is possible now."""
+        verb, status = ASKS.get(action), self.known.shown
+        return verb is None or (status.state in verb.states and not (verb.moves and status.robot.by_hand))
 
     def show(self, known: Known) -> None:
         """Draw every part from what is known."""

@@ -11,8 +11,8 @@ from pathlib import Path
 from calibrate.check.history import CheckEntry, read_checks
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, Verdict, read_calibration
-from calibrate.files.folders import calibrations_folder, current_validity
-from calibrate.files.install import installed_calibration, objections_beside
+from calibrate.files.folders import calibrations_folder, current_version, validity_of
+from calibrate.files.install import objections_beside
 from calibrate.files.touch import agrees
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
@@ -63,8 +63,8 @@ def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
     folder = calibrations_folder(root, camera)
     now, validity, log = None, None, list[LogEntry]()
     with suppress(CalibrationError):
-        now = installed_calibration(root, camera)
-        validity = current_validity(folder)
+        number, path = current_version(folder)  # one version, whatever is installed meanwhile
+        now, validity = read_calibration(path), validity_of(folder, number)
     with suppress(CalibrationError, OSError):
         log = read_log(root, camera)
     versions = {entry.generation: readable(folder, entry.generation) for entry in log}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator
+from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -75,6 +75,8 @@ class NewCell(LivePageApp[Ending]):
         self._pictures = 0
         self._news = dict[str, object]()
         """What the live page shows."""
+        self._troubles = dict[str, str]()
+        """What goes wrong with the camera, or the search for one, in this moment."""
 
     def compose(self) -> ComposeResult:
         with Horizontal(classes="frame"):
@@ -101,6 +103,7 @@ class NewCell(LivePageApp[Ending]):
         self.watch_step()
         self.set_interval(ARM_PERIOD_S, self.look_at_arm)
         self.look_at_camera()
+        self.look_for_cameras()
         self.resume()
 
     @work(group="accept", exit_on_error=False)
@@ -125,27 +128,39 @@ class NewCell(LivePageApp[Ending]):
     async def look_at_camera(self) -> None:
         while True:
             await asyncio.sleep(CAMERA_PERIOD_S)
-            try:
-                if self.setup.camera is not None:
-                    await self._look()
-                elif self.step is CellStep.CAMERA:
-                    await self._look_for_cameras()
-            except StationError as problem:
-                self._say("#problem", str(problem))
+            if self.setup.camera is not None and not await self._goes("camera", self._look()):
                 if self.live_page is not None:
                     self.live_page.publish(self._news | {"old": True})
                 await asyncio.sleep(LOOK_S)
 
-    async def _look_for_cameras(self) -> None:
-        changed = await self.setup.look_for_cameras()
-        self._say("#problem", "")
-        if changed:
+    @work(group="search", exit_on_error=False)
+    async def look_for_cameras(self) -> None:
+        """Search for as long as its step is shown: another one may be plugged in."""
+        while True:
+            if self.step is CellStep.CAMERA:
+                await self._goes("search", self._search())
+            await asyncio.sleep(LOOK_S)
+
+    async def _goes(self, what: str, work: Awaitable[None]) -> bool:
+        """Do it; on failure say why until it goes again."""
+        trouble = ""
+        try:
+            await work
+        except StationError as problem:
+            trouble = str(problem)
+        if self._troubles.get(what, "") != trouble:
+            self._troubles[what] = trouble
+            self._tell_found()
+        return not trouble
+
+    async def _search(self) -> None:
+        if await self.setup.look_for_cameras():
+            found, shown = self.setup.cameras, self.setup.draft.camera
             choice = self.query_one("#choice", OptionList)
-            choice.set_options([Option(camera.name) for camera in self.setup.cameras])
-            choice.highlighted = 0 if self.setup.cameras else None
+            choice.set_options([Option(camera.name) for camera in found])
+            choice.highlighted = found.index(shown) if shown in found else 0 if found else None
             if self.step is CellStep.CAMERA:
                 choice.focus()
-        await asyncio.sleep(LOOK_S)
 
     async def _look(self) -> None:
         setup, begun_ns, step = self.setup, time.monotonic_ns(), self.step
@@ -186,7 +201,7 @@ class NewCell(LivePageApp[Ending]):
 
     def _tell_found(self) -> None:
         found = self.setup.draft.found
-        self._say("#problem", "" if found is None else found.warning)
+        self._say("#problem", "".join(self._troubles.values()) or ("" if found is None else found.warning))
 
     # --- keys ---
 
@@ -203,10 +218,10 @@ class NewCell(LivePageApp[Ending]):
         try:
             await self.setup.arm.stop()
         except StationError as problem:
-            self.notify(f"STOP was not sent: {problem} Press the EMERGENCY STOP.", severity="error")
+            self.notify(f"STOP did not work: {problem} Press the EMERGENCY STOP.", severity="error")
             return
         self.notify(
-            "STOP was sent to the controller. If the arm moves, press the EMERGENCY STOP.",
+            "The controller stopped its program. If the arm moves, press the EMERGENCY STOP.",
             severity="warning",
         )
 
@@ -237,9 +252,8 @@ class NewCell(LivePageApp[Ending]):
         if step is CellStep.ROBOT:
             self._say("#live-lines", "Asking the controller …")
         with self._problems():
-            if chosen is not None:
-                await self.setup.open(chosen)
-            if not await accept(self.setup, step, self.query_one("#typed", Input).value.strip()):
+            seen_first = chosen is not None and await self.setup.open(chosen)
+            if seen_first or not await accept(self.setup, step, self.query_one("#typed", Input).value.strip()):
                 self.watch_step()
             elif step is CellStep.SAVE:
                 self.exit(ending)

@@ -120,6 +120,8 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
         case CellStep.ROBOT:
             why = "You move the arm." if draft.posted else "The arm is read."
             return Action("Enter", "On to the camera", why)
+        case CellStep.CAMERA if setup.camera is None and setup.cameras:
+            return Action("Enter", "Show this camera", "Up and Down choose another.")
         case CellStep.CAMERA if setup.camera is None:
             return Action("", "Connect a camera", "Check its power, cable and network.")
         case CellStep.CAMERA:

@@ -25,6 +25,7 @@ from calibrate.results import Gate
 from recordings.cli.console import open_in_browser
 from station.cell.session_folder import REPORT_FILE
 from station.operate.ending import Way, after_drift_check, after_solve
+from station.protocol.states import RESTING
 from station.tui.installed import Result, local
 from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
@@ -186,9 +187,9 @@ class ResultScreen(StationScreen):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("i", "act('install')", "Install", tooltip="Make this the cell's calibration; b undoes it"),
         Binding("b", "act('undo')", "Undo", tooltip="Back to the calibration before, or none"),
-        Binding("h", "act('touch test')", "Touch test", tooltip="Bring the tip onto corners of the board"),
+        Binding("h", "act('touch test')", "Touch", tooltip="Bring the tip onto corners of the board"),
         Binding("o", "report", "Report", tooltip="Open the report in a browser"),
-        Binding("d", "app.drift_check", "Drift check", tooltip="Capture a drift check of what is installed"),
+        Binding("d", "app.drift_check", "Check", tooltip="Capture a drift check of what is installed"),
     ]
 
     _drawn: object = ()
@@ -202,12 +203,29 @@ class ResultScreen(StationScreen):
             with VerticalScroll(id="evidence-box", classes="panel"):
                 yield Static(id="evidence")
 
+    def does_something(self, action: str) -> bool:
+        result = self.known.result
+        installed = result is not None and result.state.now is not None
+        match action:
+            case "act('install')":
+                return result is not None and not (result.installed and not result.state.withdrawn)
+            case "report":
+                return result is not None
+            case "act('undo')":
+                return installed
+            case "app.drift_check":
+                return installed and self.known.shown.state in RESTING
+            case "solve_newest":
+                return result is None
+        return super().does_something(action)
+
     def show(self, known: Known) -> None:
         super().show(known)
         result = known.result
         if result is self._drawn:
             return
         self._drawn = result
+        self.refresh_bindings()
         verdict = self.query_one("#verdict", Static)
         verdict.set_classes("" if result is None else SHOWN[result.verdict][1])
         verdict.update(Content(NO_RESULT) if result is None else verdict_lines(result))

@@ -10,11 +10,12 @@ import msgspec
 import numpy as np
 import pytest
 from textual.pilot import Pilot
-from textual.widgets import Input
+from textual.widgets import Input, OptionList, Static
 
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec, Image, Stamps
 from station.cell.config_file import load_config
+from station.cell.errors import CameraError
 from station.cell.layout import guess_matrix
 from station.cli.new import RealHardware
 from station.operate.draft import CameraChoice, CameraReader, CellStep
@@ -23,6 +24,7 @@ from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
 from station.tui.frame import StopBlock
 from station.tui.new_cell import NewCell
+from tests.codes import raises
 from tests.conftest import check_allow_list
 from tests.station.operate.guided_views import guided_joints
 from tests.tui.conftest import until
@@ -130,17 +132,21 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path, monkeypatch: p
 
 
 class GreyCamera(RealHardware):
-    """No controller, and a camera before a grey wall."""
+    """No controller, and cameras before a grey wall."""
 
     exposure_us = 10_000.0
+    plugged: tuple[CameraChoice, ...] = (CAMERA,)
+    lost = False
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
-        return (CAMERA,)
+        return self.plugged
 
     async def camera(self, found: CameraChoice) -> CameraReader:
         return self
 
     async def glimpse(self) -> Image:
+        if self.lost:
+            raise CameraError("camera-gone", camera="SIM00001")
         return Image(np.full((480, 640), 110, np.uint8), Stamps(), 0, 0)
 
     async def expose(self, exposure_us: float) -> None: ...
@@ -173,3 +179,40 @@ async def test_an_arm_that_a_program_posts_needs_a_name_a_camera_and_a_board(tmp
     assert app.return_value == "serve"
     config, _ = load_config(tmp_path / "station.yaml")
     assert (config.robot.driver, config.robot.model, config.board.columns) == ("posted", "xArm 6", 9)
+
+
+async def test_a_camera_plugged_in_later_is_found_and_shown_before_it_is_taken(tmp_path: Path) -> None:
+    hardware, other = GreyCamera(), CameraChoice("webcam", "/dev/video7", "another one")
+    app = NewCell(hardware, tmp_path, tmp_path / "station.yaml")
+    async with app.run_test(size=(80, 24)) as pilot:
+        await pilot.press(*"posted xArm 6", "enter")
+        await until(pilot, lambda: app.setup.draft.camera == CAMERA)
+        hardware.plugged = (other, CAMERA)
+        choice = app.query_one(OptionList)
+        await until(pilot, lambda: choice.option_count == 2)
+        assert choice.highlighted == 1, "the one that is shown"
+        await pilot.press("up", "enter")
+        await until(pilot, lambda: app.setup.draft.camera == other)
+        assert app.step is CellStep.CAMERA
+        hardware.lost = True
+        problem = app.query_one("#problem", Static)
+        await until(pilot, lambda: "SIM00001" in str(problem.render()))
+        hardware.lost = False
+        await until(pilot, lambda: not problem.display)
+        await pilot.press("enter")
+        await until(pilot, lambda: app.step is CellStep.MOUNTING)
+
+
+async def test_stop_takes_a_new_connection_where_the_old_one_is_refused_or_dead() -> None:
+    with start_controller("UR10e", options=("--local",)) as controller, controller.admin() as admin:
+        arm = await RealHardware().arm(controller.host)
+        try:
+            with raises("stop-refused"):
+                await arm.stop()
+            admin.ask("remote", on=True)  # what was connected in local control stays refused
+            await arm.stop()
+            assert arm.dashboard is not None
+            await arm.dashboard.close()
+            await arm.stop()
+        finally:
+            await arm.close()

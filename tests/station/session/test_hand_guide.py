@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from recordings.info import recording_info
+from station.analysis.pool import WorkerError
 from station.cell.config import vector6
 from station.cell.status import StationState as S
 from station.protocol.verbs import Skip
@@ -95,6 +96,21 @@ async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:
     await until(lambda: rig.state is S.FREE_DRIVE)
     assert captured(rig) == 1 and rig.pose_states == ["done"]
     rig.camera.jumps = 0
+
+
+async def test_what_could_not_be_checked_is_kept_only_for_who_asked(
+    guided: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def late(*of: object) -> None:
+        raise WorkerError("worker-late", function="sight")
+
+    await until(lambda: captured(guided) == 1 and guided.state is S.FREE_DRIVE)
+    monkeypatch.setattr(guided.session.context, "look_at", late)
+    lead(guided, guided_joints(TRUTH)[1])
+    await until(lambda: guided.told("not-checked") and guided.state is S.FREE_DRIVE)
+    assert guided.pose_states == ["done"]
+    await guided.session.record(1)
+    assert guided.pose_states == ["done", "done"]
 
 
 async def test_an_arm_that_tells_no_pose_neither_rests_nor_moves(guided: Rig) -> None:

@@ -94,7 +94,7 @@ _RULES = {
     "view_rms_px": _Rule("Largest rms error of a view", "≤", "px"),
     "holdout_share": _Rule("Held-out error", "≤", "share", "Check robot accuracy and corner detection."),
     "cross_validation": _Rule(
-        "Cross-validated error over the largest that was claimed",
+        "Cross-validated error over what chance explains",
         "≤",
         "",
         "Check intrinsics, board and looseness of the mounts.",
@@ -138,7 +138,7 @@ def _measured(
         missed_m = solution.holdout.e_t_m
         yield "holdout_share", missed_m / distance_m, f"({1e3 * missed_m:.2g} mm)", ""
     if folds is not None:
-        figures = f"({folds.rms_mm:.2f} mm, claimed {folds.claimed_mm:.2f} mm)"
+        figures = f"({folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm)"
         yield "cross_validation", folds.rms_mm / folds.claimed_mm / folds.limit, figures, ""
     remedy = f"Least known: {seen.weakest_text}. Add rotations about that direction."
     yield "predicted_error_m", predicted_m, f"at {(distance_m or 0.0) * 1e3:.0f} mm", remedy
@@ -155,9 +155,9 @@ def _measured(
 
 def _arm_gate(without: bool, limit: Literal["warn", "fail"]) -> Gate:
     if not without:
-        return Gate("arm", True, None, None, "Arm's own error: in the stated error PASS")
+        return Gate("arm", True, None, None, "Arm's own error: in the predicted error PASS")
     remedy = "Record joints, or state --robot-accuracy-mm."
-    text = f"Arm's own error: only its smooth part is in the stated error {limit.upper()}. {remedy}"
+    text = f"Arm's own error: only in part in the predicted error {limit.upper()}. {remedy}"
     return Gate("arm", limit == "warn", None, None, text, remedy=remedy)
 
 
@@ -166,5 +166,6 @@ def _session_gate(solution: Solution) -> Gate:
     passed = session.reading is Reading.AS_RECORDED
     told = next((remark.text for remark in solution.warnings if remark.code == session.reading.value), "")
     remedy = "" if passed else told
-    text = f"Session: {session.reading.value} {'PASS' if passed else 'FAIL. ' + told}".rstrip()
+    found = "yes PASS" if passed else f"no, {session.reading.value} FAIL. {told}"
+    text = f"Poses and board as told: {found}".rstrip()
     return Gate("session", passed, session.log_evidence_gain, None, text, remedy=remedy)

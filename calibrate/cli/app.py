@@ -73,13 +73,4 @@ CALIBRATE = LazyGroup(
     COMMANDS,
     help="From a recording to a calibration that can be trusted, installed and undone.",
     epilog="Exit codes: 0 good, 1 failed, 2 usage, 3 done with loss, 4 gate failed.",
-    gone={
-        "check": "Use drift-check.",
-        "diff": "`calibrate show` shows each; `calibrate install` tells how far it is from the one before.",
-        "fleet": "Run `calibrate list --json` on each cell.",
-        "metrics": "Use `calibrate list --json`: versions, validity and σ of every camera.",
-        "report": "Use `calibrate solve REC --report FILE`.",
-        "watch": "`calibrate drift-check FOLDER` tests production pictures; run it from a timer.",
-        "sweep": "Frame times carry their own bound; `station doctor` shows it.",
-    },
 )

@@ -38,7 +38,7 @@ def figures(calibration: Calibration) -> dict[str, ShownFigure]:
     """Collect the figures that a calibration is judged by, most important first, without unknown ones."""
     quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
     error = predicted_error(quality.predicted_error_mm, quality.working_distance_m)
-    without = ", of the arm's own the smooth part" * quality.without_arm
+    without = ", the arm's own error only in part" * quality.without_arm
     shown = {"error": replace(error, about=error.about + without)}
     if (held := quality.holdout) is not None:
         missed = f"{1000 * held.e_t_m:.3g} mm, e_R {held.e_R:.3g}"
@@ -55,7 +55,7 @@ def figures(calibration: Calibration) -> dict[str, ShownFigure]:
 def accuracy_text(calibration: Calibration) -> str:
     """Write how right the result is, and the limit, as a sentence."""
     quality, value = calibration.quality, figures(calibration)["error"].value
-    without = ", with only the smooth part of the arm's own error" * quality.without_arm
+    without = ", the arm's own error only in part" * quality.without_arm
     gates = [gate for gate in quality.gates if gate.name == "predicted_error_m"]
     limit = f" The limit is {gates[0].shown(gates[0].limit)}." if gates else ""
     point = f"A point {quality.working_distance_m or 0.0:.2f} m from the camera"

@@ -68,9 +68,9 @@ def _verdict(job: SolvedRecording) -> Iterator[str]:
 
 
 def _first_facts(job: SolvedRecording) -> str:
-    """Make the first screen: predicted error, what was calibrated and when, what could be better."""
+    """Make the first screen: what was calibrated and when, what could be better."""
     calibration, info = job.calibration, job.recording.info
-    figure = figures(calibration)["error"]
+    error = figures(calibration)["error"] if calibration.quality.failed else None  # else the verdict says it
     cell = strict_yaml.load_plain(job.recording.attachments().get("config.yaml", b"{}"))
     wall_s = info.created_wall_ns / 1e9
     rows = {
@@ -80,12 +80,11 @@ def _first_facts(job: SolvedRecording) -> str:
         "camera": f"{calibration.camera.vendor} {calibration.camera.model} {calibration.camera.serial}",
         "mounting": f"{calibration.mount}, {describe_board(calibration.board)}",
         "views": f"{len(calibration.views.used)} used, {len(calibration.views.rejected)} rejected",
-        "installed": "not when this page was written",
+        "installed": "no, when this page was written",
+        "predicted error": "" if error is None else f"{error.value} {error.about}",
     }
     return "\n".join(
         (
-            f'<p class="big">{html.escape(figure.value)}</p>',
-            html.paragraph(f"{figure.label} {figure.about}", "note"),
             html.table(("", ""), [(name, text.strip()) for name, text in rows.items() if text.strip()]),
             "<h2>What could be better?</h2>",
             html.listed((text, "") for text in _could_be_better(job)[:_REMEDIES_SHOWN]),
@@ -105,27 +104,27 @@ def _could_be_better(job: SolvedRecording) -> list[str]:
 
 
 def _picture(job: SolvedRecording) -> str:
-    """The used view that fits worst, with the board drawn in."""
+    """The used view where the board is placed worst, with the board drawn in."""
     robot = job.solution.residual_robot
     used = [view for view in job.recording.views() if view.index in robot.keys() & job.loaded.detections]
     if not used:
         return ""
-    view = max(used, key=lambda view: robot[view.index][0])
+    view = max(used, key=lambda view: _placed(job, view)[2])
     picture, off_px = _drawn_in(job, view, _FIRST_WIDTH_PX)
     return html.figure(
         picture,
-        f"Blue: the board where this calibration and the robot's pose place it. In pose {view.index + 1}, "
-        f"where the arm was off most, that is {off_px:.2f} px beside the board in the image.",
+        "Blue: the board where this calibration and the robot's pose place it. That is at most "
+        f"{off_px:.2f} px beside the board in the image, here in pose {view.index + 1}.",
     )
 
 
-def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, float]:
-    """A view with the board where robot pose, camera pose and board pose place it; how far off it is, px rms.
+def _placed(job: SolvedRecording, view: View) -> tuple[Array, Array, float]:
+    """Where robot pose, camera pose and board pose place the board: outline and corners (…, 2), px.
 
-    A board that is small in the image is shown with its surroundings only.
+    The third: how far that is from the corners in the image, px rms.
     """
     calibration, board = job.calibration, board_points(job.calibration.board)
-    image, seen = job.recording.image(view), job.loaded.detections[view.index]
+    seen = job.loaded.detections[view.index]
     X, B = calibration.transform.matrix, calibration.board_place.transform.matrix
     placed = board_in_camera(calibration.mount, np.array(view.base_from_flange), X, B)
     low, high = board.min(axis=0), board.max(axis=0)
@@ -138,6 +137,17 @@ def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, flo
 
     turns = (board_from_turned(calibration.board, q) for q in (0, *looks_same_turns(calibration.board)))
     orders = [shown_at(board[seen.indices], placed @ turned) for turned in turns]
+    off_px = min(float(np.sqrt(np.square(at - seen.pixels).sum(axis=1).mean())) for at in orders)
+    return shown_at(outline), shown_at(board), off_px
+
+
+def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, float]:
+    """A view with the board as it is placed; how far off it is, px rms.
+
+    A board that is small in the image is shown with its surroundings only.
+    """
+    outline, board, off_px = _placed(job, view)
+    image, seen = job.recording.image(view), job.loaded.detections[view.index]
     pixels = to_grey(viewable(image.pixels, image.pixel_format))
     size = np.array(pixels.shape[::-1])
     span = size * min(1.0, 2.4 * float(np.ptp(seen.pixels, axis=0).max()) / size.max())
@@ -148,15 +158,13 @@ def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, flo
     bright = np.clip(small * (245.0 / max(float(np.percentile(small, 99.5)), 1.0)), 0, 255).astype(np.uint8)
     canvas = cv2.cvtColor(bright, cv2.COLOR_GRAY2BGR)
     sixteenths = [
-        np.rint(16 * ((at - corner + 0.5) * scale - 0.5)).astype(np.int32)
-        for at in (shown_at(outline), shown_at(board))
+        np.rint(16 * ((at - corner + 0.5) * scale - 0.5)).astype(np.int32) for at in (outline, board)
     ]
     cv2.polylines(canvas, sixteenths[:1], False, _DRAWN_IN, 2, cv2.LINE_AA, 4)
     for dot in sixteenths[1].tolist():
         cv2.circle(canvas, dot, width_px // 11, _DRAWN_IN, 2, cv2.LINE_AA, 4)
     jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 65])[1].tobytes()
-    shown = html.picture(jpeg, f"pose {view.index + 1} with the board drawn in")
-    return shown, min(float(np.sqrt(np.square(at - seen.pixels).sum(axis=1).mean())) for at in orders)
+    return html.picture(jpeg, f"pose {view.index + 1} with the board drawn in"), off_px
 
 
 def rehearsal_text(job: SolvedRecording) -> str:
@@ -200,9 +208,6 @@ def _gates(job: SolvedRecording) -> Iterator[str]:
 def _error(job: SolvedRecording) -> Iterator[str]:
     quality = job.calibration.quality
     yield html.paragraph(noise_text(job.calibration))
-    if quality.holdout is not None:
-        held = figures(job.calibration)["held_out"]
-        yield html.paragraph(f"{held.label.capitalize()}: {held.value} {held.about}.")
     yield html.paragraph(f"Least known: {quality.weakest}." if quality.weakest else "")
     yield from map(
         html.paragraph, (*_could_be_better(job)[_REMEDIES_SHOWN:], *arm_sentences(job.calibration))
@@ -214,13 +219,12 @@ def _plots(job: SolvedRecording) -> Iterator[str]:
     if px := solution.residual_px:
         limit = next((gate.limit for gate in job.gates if gate.name == "view_rms_px"), None)
         worst = max(px, key=lambda index: px[index])
-        answer = f"Most: pose {worst + 1}, {px[worst]:.2f} px" + f" (limit {limit:g} px)." * (
-            limit is not None
-        )
-        yield html.figure(plots.by_view(px, "px", limit), answer, "Does a picture stand out?")
+        against = "." if limit is None else f" (limit {limit:g} px)."
+        answer = f"Largest: pose {worst + 1}, {px[worst]:.2f} px{against}"
+        yield html.figure(plots.by_view(px, "px", limit), answer, "Does an image stand out?")
     if robot_mm := {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}:
         worst = max(robot_mm, key=lambda index: robot_mm[index])
-        answer = f"Most: pose {worst + 1}, {robot_mm[worst]:.2f} mm from where the picture says."
+        answer = f"Largest: pose {worst + 1}, {robot_mm[worst]:.2f} mm from where the image says."
         yield html.figure(plots.by_view(robot_mm, "mm"), answer, "Was the arm where it said?")
     if shares := error_shares(job.calibration):
         answer = "Shares of the variance of the camera pose."

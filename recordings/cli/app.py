@@ -33,5 +33,4 @@ RECORDINGS = LazyGroup(
     },
     help="Look into, make, convert and rescue recordings.",
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage, 3 done with loss.",
-    gone={"excerpt": "Copy the recording, or use `recordings export REC --to folder -o images`."},
 )

@@ -34,13 +34,6 @@ _EXTRAS = {
 ALL = "`COMMAND -h`: its options. `--all`: every command. `--version`."
 
 
-class GoneError(CodedError):
-    """A command of an earlier release is asked for."""
-
-    code = "gone"
-    exit_code = 2
-
-
 class LazyCommand(NamedTuple):
     """One command of a group."""
 
@@ -73,18 +66,9 @@ class LazyCommand(NamedTuple):
 
 
 class LazyGroup(TyperGroup):
-    """A command line of `LazyCommand`s.
+    """A command line of `LazyCommand`s."""
 
-    `gone`: commands that are no more, and what to do instead.
-    """
-
-    def __init__(
-        self,
-        commands: Mapping[str, LazyCommand],
-        help: str,
-        epilog: str,
-        gone: Mapping[str, str] = {},
-    ) -> None:
+    def __init__(self, commands: Mapping[str, LazyCommand], help: str, epilog: str) -> None:
         super().__init__(
             commands={name: TyperCommand(name) for name in commands},
             help=help,
@@ -94,7 +78,7 @@ class LazyGroup(TyperGroup):
             context_settings=_HELP_KEYS,
             params=_group_options(),
         )
-        self._lazy, self._gone = commands, gone
+        self._lazy = commands
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a stub, which holds the command's line in the group's help."""
@@ -118,8 +102,6 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Load the command that is asked for: the group itself holds a stub with its line of help."""
-        if args[0] in self._gone:
-            raise GoneError(word=args[0], instead=self._gone[args[0]])
         name, _, rest = super().resolve_command(ctx, args)
         if name is None:
             return None, None, rest

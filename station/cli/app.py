@@ -71,16 +71,6 @@ STATION = LazyGroup(
             ("station doctor --example > station.yaml", "station doctor --config station.yaml"),
         ),
     },
-    gone={
-        "board": "`calibrate board` makes one.",
-        "bootstrap": "`station new` finds camera and board from views that you guide by hand.",
-        "check": "Use drift-check.",
-        "next-pose": "F3 on the screen adds views that you guide by hand.",
-        "replan": "`station finish`, then `station plan` plans again.",
-        **dict.fromkeys(("touch-test", "verify"), "Press h on Result of the screen: `station`."),
-        "watch": "`calibrate drift-check FOLDER` tests production pictures; run it from a timer.",
-        "trace": "The simulated controller's limits are in the docs: The simulator.",
-    },
     help="A calibration station for a robot cell. Alone: the operator's screen.",
     epilog="Exit codes: 0 good, 1 failed, 2 usage, 3 done with loss, 4 gate failed.",
 )

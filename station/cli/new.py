@@ -43,7 +43,7 @@ class GuidedArm(UrLink):
         if self.dashboard is not None:
             with contextlib.suppress(RobotError):
                 said = await self.dashboard.ask(STOP)
-        if said != STOPPED:  # the connection is dead, or of local control: it is refused in remote control too
+        if said != STOPPED:  # dead, or opened in local control: refused even after the switch to remote
             said = await (await self.renew_dashboard()).ask(STOP)
         if said != STOPPED:
             raise RobotError("stop-refused", answer=said)

@@ -115,7 +115,7 @@ async def serve_cell(
         cell.ended()
     logging.shutdown()
     sys.stdout.flush()
-    util._run_finalizers(0)  # `_exit` skips them: the worker's semaphores would be reported as leaked
+    util._run_finalizers(0)  # type: ignore[attr-defined]  # else the worker's semaphores count as leaked
     os._exit(0)
 
 

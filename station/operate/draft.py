@@ -68,7 +68,7 @@ class ArmReader(Protocol):
         """Why the arm cannot be guided now, and what to do on the pendant; empty: nothing."""
 
     async def stop(self) -> None:
-        """STOP, by the dashboard: it ends whatever program runs on the controller. RobotError where it did not."""
+        """STOP, by the dashboard: it ends whatever program runs on the controller. RobotError if refused."""
 
     async def close(self) -> None: ...
 

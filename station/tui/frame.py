@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, ClassVar, TypeVar
 
 from rich.filesize import decimal
-from textual import events
 from textual.app import ComposeResult
 from textual.binding import ActiveBinding
 from textual.containers import Container, Horizontal, Vertical
@@ -21,7 +20,7 @@ from station.cell.status import StationStatus
 from station.protocol import verbs
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Verb
-from station.tui.task import STEPS, Action, Known, Step, next_action, steps
+from station.tui.task import Action, Known, Step, next_action, steps
 from station.tui.words import MARKS, dim, duration, shortened, state_of
 
 R = TypeVar("R")
@@ -90,15 +89,6 @@ class Line(Static):
         return lines != shown and height is not None and height.is_auto
 
 
-class Rail(Line):
-    """The steps of the task; a click opens one."""
-
-    def on_click(self, event: events.Click) -> None:
-        if self.size.height > 1:
-            place = min(len(STEPS) - 1, len(STEPS) * event.x // self.size.width)
-            self.run_worker(self.app.run_action(f"switch_mode('{STEPS[place]}')"))
-
-
 class Frame(Horizontal):
     """The first rows of every screen and of every question over it."""
 
@@ -109,7 +99,7 @@ class Frame(Horizontal):
     def compose(self) -> ComposeResult:
         with Vertical(classes="head"):
             yield Line(lambda known, width: bar_line(known, self._title, width), id="bar")
-            yield Rail(lambda known, width: rail_line(steps(known), self._mode, width), id="rail")
+            yield Line(lambda known, width: rail_line(steps(known), self._mode, width), id="rail")
             yield Line(self._next, id="next", layout=True)
         yield StopBlock(id="stop")
 
@@ -239,6 +229,7 @@ ASKS: dict[str, type[Verb[Any]]] = {
     "ask('record')": verbs.Record,
     "take_back": verbs.Record,
     "act('touch test')": verbs.Observe,
+    "app.drift_check": verbs.Freedrive,
 }
 """Verb by the action of a key that asks the daemon for it."""
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -75,8 +75,8 @@ class NewCell(LivePageApp[Ending]):
         self._pictures = 0
         self._news = dict[str, object]()
         """What the live page shows."""
-        self._troubles = dict[str, str]()
-        """What goes wrong with the camera, or the search for one, in this moment."""
+        self._lost, self._searched_s = False, 0.0
+        """The camera, or the search for one, failed at the last look; when cameras were searched last."""
 
     def compose(self) -> ComposeResult:
         with Horizontal(classes="frame"):
@@ -103,7 +103,6 @@ class NewCell(LivePageApp[Ending]):
         self.watch_step()
         self.set_interval(ARM_PERIOD_S, self.look_at_arm)
         self.look_at_camera()
-        self.look_for_cameras()
         self.resume()
 
     @work(group="accept", exit_on_error=False)
@@ -128,32 +127,23 @@ class NewCell(LivePageApp[Ending]):
     async def look_at_camera(self) -> None:
         while True:
             await asyncio.sleep(CAMERA_PERIOD_S)
-            if self.setup.camera is not None and not await self._goes("camera", self._look()):
+            try:
+                if self.step is CellStep.CAMERA and time.monotonic() > self._searched_s + LOOK_S:
+                    await self._look_for_cameras()  # each time anew: another may be plugged in
+                    self._searched_s = time.monotonic()
+                if self.setup.camera is not None:
+                    await self._look()
+                if self._lost:
+                    self._lost = False
+                    self._tell_found()
+            except StationError as problem:
+                self._lost = True
+                self._say("#problem", str(problem))
                 if self.live_page is not None:
                     self.live_page.publish(self._news | {"old": True})
                 await asyncio.sleep(LOOK_S)
 
-    @work(group="search", exit_on_error=False)
-    async def look_for_cameras(self) -> None:
-        """Search for as long as its step is shown: another one may be plugged in."""
-        while True:
-            if self.step is CellStep.CAMERA:
-                await self._goes("search", self._search())
-            await asyncio.sleep(LOOK_S)
-
-    async def _goes(self, what: str, work: Awaitable[None]) -> bool:
-        """Do it; on failure say why until it goes again."""
-        trouble = ""
-        try:
-            await work
-        except StationError as problem:
-            trouble = str(problem)
-        if self._troubles.get(what, "") != trouble:
-            self._troubles[what] = trouble
-            self._tell_found()
-        return not trouble
-
-    async def _search(self) -> None:
+    async def _look_for_cameras(self) -> None:
         if await self.setup.look_for_cameras():
             found, shown = self.setup.cameras, self.setup.draft.camera
             choice = self.query_one("#choice", OptionList)
@@ -201,7 +191,7 @@ class NewCell(LivePageApp[Ending]):
 
     def _tell_found(self) -> None:
         found = self.setup.draft.found
-        self._say("#problem", "".join(self._troubles.values()) or ("" if found is None else found.warning))
+        self._say("#problem", "" if found is None else found.warning)
 
     # --- keys ---
 
@@ -218,7 +208,8 @@ class NewCell(LivePageApp[Ending]):
         try:
             await self.setup.arm.stop()
         except StationError as problem:
-            self.notify(f"STOP did not work: {problem} Press the EMERGENCY STOP.", severity="error")
+            words = f"STOP did not work: {problem} Press the EMERGENCY STOP."
+            self.notify(words, severity="error", markup=False)
             return
         self.notify(
             "The controller stopped its program. If the arm moves, press the EMERGENCY STOP.",
@@ -252,8 +243,10 @@ class NewCell(LivePageApp[Ending]):
         if step is CellStep.ROBOT:
             self._say("#live-lines", "Asking the controller …")
         with self._problems():
-            seen_first = chosen is not None and await self.setup.open(chosen)
-            if seen_first or not await accept(self.setup, step, self.query_one("#typed", Input).value.strip()):
+            text, look_first = self.query_one("#typed", Input).value.strip(), False
+            if chosen is not None:
+                look_first = await self.setup.open(chosen)
+            if look_first or not await accept(self.setup, step, text):
                 self.watch_step()
             elif step is CellStep.SAVE:
                 self.exit(ending)

@@ -87,7 +87,7 @@ class PlanScreen(StationScreen):
     def _cell(self, known: Known, width: int, height: int) -> Content:
         scene = cell_scene(known.configuration, known.shown)
         if scene is None:
-            return dim("To draw the cell, the configuration needs initial camera and board poses.")
+            return dim("No drawing: no initial poses are configured, or this console has no signs for it.")
         chosen = self.table.cursor_row if known.shown.session.poses else None
         return draw(scene, known.shown, chosen, width, height)
 

@@ -25,7 +25,6 @@ from calibrate.results import Gate
 from recordings.cli.console import open_in_browser
 from station.cell.session_folder import REPORT_FILE
 from station.operate.ending import Way, after_drift_check, after_solve
-from station.protocol.states import RESTING
 from station.tui.installed import Result, local
 from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
@@ -211,10 +210,8 @@ class ResultScreen(StationScreen):
                 return result is not None and not (result.installed and not result.state.withdrawn)
             case "report":
                 return result is not None
-            case "act('undo')":
-                return installed
-            case "app.drift_check":
-                return installed and self.known.shown.state in RESTING
+            case "act('undo')" | "app.drift_check" if not installed:
+                return False
             case "solve_newest":
                 return result is None
         return super().does_something(action)

@@ -9,10 +9,6 @@ from importlib.metadata import version
 
 import pytest
 
-from recordings.cli.lazy import LazyCommand, LazyGroup
-from recordings.errors import CodedError
-from tests.codes import raises
-
 
 def run(program: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", program, *arguments]
@@ -42,10 +38,3 @@ def test_a_missing_extra_is_named_in_one_line() -> None:
     )
     assert done.returncode == 2
     assert "calibration-station[station]" in done.stderr and len(done.stderr.splitlines()) == 1
-
-
-def test_what_is_gone_is_refused_with_what_to_do_instead() -> None:
-    group = LazyGroup({"new": LazyCommand("x:y")}, "", "", gone={"old": "Use new."})
-    with raises("gone", CodedError) as refused:
-        group(["old"], prog_name="x")
-    assert (refused.value.remedy, refused.value.exit_code) == ("Use new.", 2)

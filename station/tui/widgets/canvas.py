@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from textual.content import Content
 
-from station.tui.themes import few_signs
-
 Points = NDArray[np.float64]
 BRAILLE = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 """Bits of a braille letter's dots, rows from the top."""
-BLOCKS = " ▀▄█"
+PER_LETTER = (2, 4)
+"""Dots across and down."""
 
 
 class Canvas:
@@ -25,9 +24,7 @@ class Canvas:
 
     def __init__(self, width: int, height: int) -> None:
         self.columns, self.rows = max(1, width), max(1, height)
-        self._blocks = few_signs()
-        self._per = (1, 2) if self._blocks else (2, 4)
-        self.width, self.height = self.columns * self._per[0], self.rows * self._per[1]
+        self.width, self.height = self.columns * PER_LETTER[0], self.rows * PER_LETTER[1]
         self._dots = np.zeros((self.height, self.width), dtype=bool)
         self._rank = np.zeros((self.rows, self.columns), dtype=int)
         self._texts: list[tuple[int, int, str, int]] = []
@@ -39,7 +36,7 @@ class Canvas:
         at = np.floor(where).astype(int)
         at = at[(at >= 0).all(axis=1) & (at[:, 0] < self.width) & (at[:, 1] < self.height)]
         self._dots[at[:, 1], at[:, 0]] = True
-        np.maximum.at(self._rank, (at[:, 1] // self._per[1], at[:, 0] // self._per[0]), rank)
+        np.maximum.at(self._rank, (at[:, 1] // PER_LETTER[1], at[:, 0] // PER_LETTER[0]), rank)
 
     def lines(self, starts: Points, ends: Points, rank: int, dash: int = 0) -> None:
         """Draw lines from (n, 2) to (n, 2) places; `dash`: length of dashes and gaps in dots, 0: solid."""
@@ -70,19 +67,15 @@ class Canvas:
     def text(self, at: Points, words: str, rank: int) -> None:
         """Write words; their first letter is the one with the dot `at` (2,)."""
         if np.isfinite(at).all():
-            column, row = (at // self._per).astype(int).tolist()
+            column, row = (at // PER_LETTER).astype(int).tolist()
             self._texts.append((column, row, words, rank))
 
     def content(self, styles: Sequence[str]) -> Content:
         """Return the drawing; `styles` of the ranks, from rank 1 on."""
-        across, down = self._per
+        across, down = PER_LETTER
         cells = self._dots.reshape(self.rows, down, self.columns, across).transpose(0, 2, 1, 3)
-        if self._blocks:
-            codes = cells[..., 0, 0] + 2 * cells[..., 1, 0]
-            letters = [[BLOCKS[code] for code in row] for row in codes.tolist()]
-        else:
-            codes = (cells * BRAILLE).sum(axis=(2, 3))
-            letters = [[chr(0x2800 + code) if code else " " for code in row] for row in codes.tolist()]
+        codes = (cells * BRAILLE).sum(axis=(2, 3))
+        letters = [[chr(0x2800 + code) if code else " " for code in row] for row in codes.tolist()]
         rank = self._rank.copy()
         for column, row, words, order in sorted(self._texts, key=lambda text: text[3]):
             for i, letter in enumerate(words):

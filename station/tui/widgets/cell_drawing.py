@@ -17,6 +17,7 @@ from station.cell.config import StationConfig
 from station.cell.errors import StationError
 from station.cell.layout import CellLayout, board_extent, frustum, layout_of
 from station.cell.status import StationStatus
+from station.tui.themes import few_signs
 from station.tui.widgets.canvas import Canvas
 
 STYLES = ("$line", "$bad", "$accent", "$ok", "$strong", "bold $strong", "bold $warn")
@@ -38,8 +39,11 @@ def _scene(encoded: bytes) -> CellLayout | None:
 
 
 def cell_scene(config: StationConfig | None, status: StationStatus) -> CellLayout | None:
-    """Return the configured cell, camera and board where they were estimated; None without initial poses."""
-    if config is None or (scene := _scene(msgspec.json.encode(config))) is None:
+    """Return the configured cell, camera and board where they were estimated.
+
+    None without initial poses, and on a console, whose font has no braille.
+    """
+    if few_signs() or config is None or (scene := _scene(msgspec.json.encode(config))) is None:
         return None
     estimate = status.estimate
     if estimate.camera_pose is None or estimate.board_pose is None:

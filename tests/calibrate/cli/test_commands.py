@@ -244,11 +244,6 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(small_session_file: Path
     again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
     assert again.returncode == 0
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
-    refused(run("fleet", "cells", cwd=tmp_path), 2, "gone", "calibrate list")
-    refused(run("metrics", cwd=tmp_path), 2, "gone", "calibrate list")
-    refused(run("sweep", "sweep.mcap", cwd=tmp_path), 2, "gone", "station doctor")
-    refused(run("diff", "a.yaml", "b.yaml", cwd=tmp_path), 2, "gone", "calibrate show")
-    refused(run("report", recordings[0], cwd=tmp_path), 2, "gone", "--report")
     for option in ("--time-offset=a.yaml", "--accept-move"):
         refused(run("solve", recordings[0], option, cwd=tmp_path), 2, "", option.partition("=")[0])
     alone = run("solve", recordings[0], "-o", "alone.yaml", cwd=tmp_path)

@@ -142,10 +142,6 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
         (("capture", "--plan", "absent.yaml"), 2, "unreadable-plan"),
         (("tui",), 1, "no-terminal"),
         (("demo", "--out", __file__), 2, "not-a-folder"),
-        (("bootstrap", "--config", "absent.yaml"), 2, "gone"),
-        (("verify",), 2, "gone"),
-        (("check",), 2, "gone"),
-        (("trace", "record", "192.0.2.1"), 2, "gone"),
     ],
 )
 def test_what_a_person_can_cause_has_a_code(args: tuple[str, ...], exit_code: int, code: str) -> None:

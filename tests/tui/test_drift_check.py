@@ -13,20 +13,17 @@ from calibrate.check.history import CheckEntry, append_check
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
 from station.cell.pose_plan import Plan, PlannedPose
-from station.cell.status import CHECK_VIEWS, StationState, StationStatus
-from station.operate.drift_check import SEED
+from station.cell.status import StationState, StationStatus
 from station.protocol import verbs
 from station.tui import jobs
-from station.tui.daemon_link import REMEDIES, busy_words
+from station.tui.daemon_link import REMEDIES
 from station.tui.dialogs import ConfirmMotion, JobScreen
 from station.tui.installed import read_installed
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, said, text_of, until
 from tests.tui.test_install import GOOD
-from tests.tui.test_plan_screen import SlowPlanner
 
 CHECK_PLAN = "cd" * 32
 LOADED = Plan("UR10", "eye-in-hand", (PlannedPose("p1", (0.0,) * 6),) * 3)
-PLANNING = busy_words(verbs.MakePlan(CHECK_VIEWS, SEED, lens_known=True))
 JOB = """
 import json, pathlib, sys
 (pathlib.Path(__file__).parent / "asked").write_text(json.dumps(sys.argv[1:]))
@@ -34,16 +31,12 @@ print("The installed calibration holds.")
 """
 
 
-def install_on(link: FakeLink, folder: Path) -> None:
-    write_calibration(GOOD, folder / "c.yaml")
-    link.root = folder / "root"
-    install(folder / "c.yaml", root=link.root, cell="simulated")
-
-
 @pytest.fixture
 def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The daemon's root, with something installed; the check itself is a job that notes what it was asked."""
-    install_on(link, tmp_path)
+    write_calibration(GOOD, tmp_path / "c.yaml")
+    link.root = tmp_path / "root"
+    install(tmp_path / "c.yaml", root=link.root, cell="simulated")
     link.answers["make_plan"] = verbs.Done()
     link.answers["plan"] = verbs.LoadedPlan(LOADED)
     (tmp_path / "some_job.py").write_text(JOB)
@@ -94,23 +87,6 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
         asked = json.loads((installed / "asked").read_text())
         assert asked == ["drift-check", recording, "--root", str(installed / "root")]
         await until(pilot, lambda: any("holds" in line for line in app.screen.said))  # type: ignore[attr-defined]
-
-
-async def test_planning_it_is_said_on_every_screen(tmp_path: Path) -> None:
-    link = SlowPlanner()
-    install_on(link, tmp_path)
-    link.answers |= {"plan": verbs.LoadedPlan(LOADED), "make_plan": verbs.Done()}
-    app = app_on(link)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await ask_for_it(pilot)
-        await until(pilot, lambda: PLANNING in text_of(app, "#next"))
-        await pilot.press("6")
-        await until(pilot, lambda: app.current_mode == "log" and PLANNING in text_of(app, "#next"))
-        link.show(idle(StationState.PAUSED, "poses 3, 7 failed: retake or skip them, or finish"))
-        await until(pilot, lambda: "poses 3, 7 failed" in text_of(app, "#next"))
-        assert PLANNING in text_of(app, "#next")
-        link.made.set()
-        await until(pilot, lambda: not app.known.busy)
 
 
 def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) -> None:

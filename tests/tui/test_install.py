@@ -10,8 +10,9 @@ import pytest
 from rich.console import Console
 from textual.pilot import Pilot
 from textual.widgets import Input, Static
+from textual.widgets._footer import FooterKey
 
-from calibrate.files.calibration import Override, write_calibration
+from calibrate.files.calibration import Calibration, Override, read_calibration, write_calibration
 from calibrate.files.folders import calibrations_folder, current_validity
 from calibrate.files.formatting import figures, summary
 from calibrate.files.install import install, installed_calibration
@@ -19,13 +20,14 @@ from calibrate.files.touch import Touch
 from calibrate.files.validity import Validity, ValidityReason, ValidityState
 from calibrate.files.versions import installed_versions, note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
+from station.cell.status import StationState
 from station.tui.dialogs import Confirm, Reason
-from station.tui.installed import Installed, Result
+from station.tui.installed import Installed, Result, read_installed
 from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
-from tests.tui.conftest import FakeLink, app_on, opened, said, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, opened, said, text_of, until
 
 GOOD = calibration_of(
     TRUTH, RobotIdentity(serial="1", model="UR10"), CameraIdentity(serial="2", model="camera")
@@ -176,6 +178,38 @@ async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready
         told = text_of(pilot.app, "#verdict")
         assert "PASS WITH A REASON, installs only with a reason" in told
         assert "Regression" in told
+
+
+@pytest.mark.parametrize("state", [StationState.IDLE, StationState.PAUSED, StationState.MOVING])
+async def test_every_key_that_does_something_is_in_the_footer(
+    link: FakeLink, calibration: Path, state: StationState
+) -> None:
+    install(calibration, calibration.parents[2], cell="simulated", override="measured with the tape")
+    link.show(idle(state))
+    async with opened(link) as pilot:
+        await press_on_result(pilot, calibration)
+        await until(pilot, lambda: pilot.app.screen.query("FooterKey"))
+        keys = {key.key: key.region.right for key in pilot.app.screen.query(FooterKey)}
+        assert max(keys.values()) <= 80 and "i" not in keys and "b" in keys
+        assert ("d" in keys, "f6" in keys) == (state is not StationState.MOVING, state is StationState.MOVING)
+
+
+def test_what_is_installed_and_its_validity_are_of_one_version(
+    calibration: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, read = calibration.parents[2], read_calibration
+    write_calibration(GOOD, calibration)
+    install(calibration, root, cell="simulated")
+
+    def meanwhile(path: Path) -> Calibration:
+        monkeypatch.setattr("station.tui.installed.read_calibration", read)
+        write_calibration(LATER, calibration)
+        install(calibration, root, cell="simulated")
+        return read(path)
+
+    monkeypatch.setattr("station.tui.installed.read_calibration", meanwhile)
+    found = read_installed(root)
+    assert found.now == GOOD and found.validity is not None and found.validity.version == 1
 
 
 def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() -> None:

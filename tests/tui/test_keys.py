@@ -107,15 +107,6 @@ async def test_only_what_ends_control_of_an_arm_at_work_asks(
         assert pilot.app._exit is not asks and verbs.Release() not in link.asked
 
 
-async def test_many_resizes_leave_a_working_screen(link: FakeLink) -> None:
-    async with opened(link) as pilot:
-        for i in range(0, 100, 25):
-            await pilot.resize_terminal(60 + i, 20 + i % 40)
-        await pilot.resize_terminal(80, 24)
-        await pilot.pause()
-        assert "F12" in text_of(pilot.app, "#stop")
-
-
 async def test_what_a_stop_refused_is_not_said_any_more_after_it(link: FakeLink) -> None:
     """A notice outlives its reason by seconds otherwise."""
     link.show(idle(StationState.STOPPED, "STOP by ann"))
@@ -130,9 +121,3 @@ async def test_what_a_stop_refused_is_not_said_any_more_after_it(link: FakeLink)
         link.refuse.clear()
         await pilot.press("f8")
         await until(pilot, lambda: not pilot.app._notifications)
-        await pilot.press("f3", "f9")
-        await until(pilot, lambda: len(pilot.app._notifications) == 1)
-        await pilot.press("f5")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
-        await pilot.press("tab", "enter")
-        await until(pilot, lambda: "go" in link.verbs and not pilot.app._notifications)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import cast
-
 import msgspec
 import pytest
 from hypothesis import given
@@ -20,11 +17,9 @@ from station.cell.status import (
     StationState,
     StationStatus,
 )
-from station.operate.draft import Hardware
 from station.protocol.verbs import Check
 from station.tui.dialogs import Confirm, ConfirmMotion, Reason
 from station.tui.frame import StopBlock, bar_line, next_line, rail_line
-from station.tui.new_cell import NewCell
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from tests.recordings.small_recording import make_state
 from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, in_session, opened, said, text_of, until
@@ -220,15 +215,6 @@ async def test_the_screens_have_no_stop_for_an_arm_that_a_person_moves(
         await until(pilot, lambda: pilot.app.known.live is None)  # type: ignore[attr-defined]
         await pilot.press("f12")
         await until(pilot, lambda: link.send_stop() in said(pilot))
-
-
-async def test_stop_can_be_clicked_in_the_wizard_too(tmp_path: Path) -> None:
-    app = NewCell(cast(Hardware, None), tmp_path, tmp_path / "station.yaml")
-    async with app.run_test(size=(80, 24)) as pilot:
-        await pilot.click(StopBlock)
-        await until(
-            pilot, lambda: [said.severity for said in app._notifications] == ["error"]
-        )  # no arm is there
 
 
 async def test_without_colours_stop_and_chips_are_reversed(

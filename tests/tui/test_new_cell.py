@@ -199,8 +199,6 @@ async def test_a_camera_plugged_in_later_is_found_and_shown_before_it_is_taken(t
         await until(pilot, lambda: "SIM00001" in str(problem.render()))
         hardware.lost = False
         await until(pilot, lambda: not problem.display)
-        await pilot.press("enter")
-        await until(pilot, lambda: app.step is CellStep.MOUNTING)
 
 
 async def test_stop_takes_a_new_connection_where_the_old_one_is_refused_or_dead() -> None:

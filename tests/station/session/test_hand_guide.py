@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from typing import Any
+from unittest.mock import AsyncMock
 
 import pytest
 
@@ -101,10 +102,8 @@ async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:
 async def test_what_could_not_be_checked_is_kept_only_for_who_asked(
     guided: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def late(*of: object) -> None:
-        raise WorkerError("worker-late", function="sight")
-
     await until(lambda: captured(guided) == 1 and guided.state is S.FREE_DRIVE)
+    late = AsyncMock(side_effect=WorkerError("worker-late", function="sight"))
     monkeypatch.setattr(guided.session.context, "look_at", late)
     lead(guided, guided_joints(TRUTH)[1])
     await until(lambda: guided.told("not-checked") and guided.state is S.FREE_DRIVE)

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
 from calibrate.geometry import Array, difference, is_rigid, pose, project_to_rotation, rotation_angle, skew
-from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses, screw_invariants
+from calibrate.handeye.axxb.pairs import Pairs, screw_invariants
 from calibrate.projection import camera_matrix, distortion
 from calibrate.results import HoldoutScore
 from calibrate.views import BoardView, ViewSet, require_no_copies
@@ -215,18 +215,3 @@ def picture_coverage(views: Sequence[BoardView], camera: CameraModel) -> float:
 HELD_OUT = 6
 FEWEST_FITTED = 5
 """Fewest views that a fit to be scored by the held-out ones has."""
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    fitted: ViewSet
-    pairs: Pairs
-
-
-def held_out(views: ViewSet) -> HeldOut | None:
-    """Hold out all pairs inside the last 6 views; None for too few views."""
-    fitted = len(views) - HELD_OUT
-    if fitted < FEWEST_FITTED:
-        return None
-    H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
-    return HeldOut(views.select(list(range(fitted))), all_pairs(H[fitted:], C[fitted:]))

@@ -29,10 +29,10 @@ from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.linear import MAX_STEPS
 from calibrate.handeye.metrics import (
-    HeldOut,
+    FEWEST_FITTED,
+    HELD_OUT,
     board_spread,
     distance_in_sigmas,
-    held_out,
     mean_pose,
     motion_errors,
     placed_boards,
@@ -48,6 +48,8 @@ from calibrate.results import SHAPE, PeerResult
 from calibrate.views import ViewSet, observe_views
 
 Method = Callable[[ViewSet], Array]
+HeldOut = tuple[ViewSet, Pairs]
+"""The views that are fitted, and all pairs inside the last 6, which score them."""
 PAPER = "DE, paper"
 _MAX_PAIRS = 2000
 _EXACT = 1e-6
@@ -64,12 +66,22 @@ def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[Pee
     ours = solve_robust_profile(views, options)
     ours_ms = 1e3 * (time.perf_counter() - start)
     kept = replace(views, views=ours.kept)
-    held = held_out(kept)
+    held = _held_out(kept)
     rows = [_row(name, method, kept, held, ours) for name, method in _methods(options).items()]
     final = _scored("ours", ours.matrix, kept, ours)
     if ours.holdout is not None:
         final = replace(final, e_t_m=ours.holdout.e_t_m, e_R=ours.holdout.e_R)
     return [*rows, replace(final, time_ms=ours_ms, note="time with held-out scores, outliers and proof")]
+
+
+def _held_out(views: ViewSet) -> HeldOut | None:
+    """Hold out the last views; None where too few are left."""
+    fitted, (H, C) = len(views) - HELD_OUT, _pose_arrays(views)
+    return (
+        None
+        if fitted < FEWEST_FITTED
+        else (views.select([*range(fitted)]), all_pairs(H[fitted:], C[fitted:]))
+    )
 
 
 def _methods(options: SolveOptions) -> dict[str, Method]:
@@ -131,7 +143,7 @@ def _row(name: str, method: Method, views: ViewSet, held: HeldOut | None, ours: 
     try:
         X = method(views)
         elapsed_ms = 1e3 * (time.perf_counter() - start)
-        partial_X = X if held is None else method(held.fitted)
+        partial_X = X if held is None else method(held[0])
     except (CalibrationError, cv2.error, np.linalg.LinAlgError, ValueError) as error:
         return PeerResult(name, None, note=f"failed: {str(error).splitlines()[0]}")
     if not np.isfinite(X).all():
@@ -141,7 +153,7 @@ def _row(name: str, method: Method, views: ViewSet, held: HeldOut | None, ours: 
         row = replace(row, on_box=boxed, note=f"on the paper's box ({', '.join(boxed)}): X is wrong")
     if held is None or not np.isfinite(partial_X).all():
         return row
-    e_t, e_R = motion_errors(partial_X, held.pairs)
+    e_t, e_R = motion_errors(partial_X, held[1])
     return replace(row, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()))
 
 

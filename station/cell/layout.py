@@ -87,10 +87,10 @@ def frustum(camera: CameraModel, base_from_camera: Array, far_m: float) -> Array
     return transform_points(base_from_camera, np.vstack([np.zeros(3), far_m * corners]))
 
 
-def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike, why: str = "") -> PlannedPose:
+def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike) -> PlannedPose:
     """Make a plan's pose from joints (6,), with the expected flange pose."""
     joints = np.asarray(joints_rad, dtype=float)
-    return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)), why=why)
+    return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)))
 
 
 def board_extent(board: BoardSpec) -> tuple[Array, Array]:

@@ -41,7 +41,7 @@ def die_with_parent(parent_pid: int) -> None:
         os._exit(1)
 
 
-def go_before_others(niceness: int, autogroup: Path = Path("/proc/self/autogroup")) -> None:
+def go_before_others(niceness: int) -> None:
     """Set this niceness, or keep a lower one; without permission nothing changes.
 
     Where Linux groups processes by session (autogroup), niceness counts only within the group. There the
@@ -51,7 +51,7 @@ def go_before_others(niceness: int, autogroup: Path = Path("/proc/self/autogroup
         wanted = min(niceness, os.getpriority(os.PRIO_PROCESS, 0))
         os.setpriority(os.PRIO_PROCESS, 0, wanted)
         if os.getsid(0) == os.getpid():  # only a session of its own, not a shell's or terminal's
-            autogroup.write_text(str(wanted))
+            Path("/proc/self/autogroup").write_text(str(wanted))
 
 
 def control_in_real_time() -> None:

@@ -117,9 +117,9 @@ def _with_user(camera: FoundCamera) -> FoundCamera:
     return msgspec.structs.replace(camera, controlled=True, controlled_from=told)
 
 
-def _register(address: str, register: int, wait_s: float = 0.3) -> int | None:
+def _register(address: str, register: int) -> int | None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-        link.settimeout(wait_s)
+        link.settimeout(0.3)
         try:
             link.sendto(struct.pack(">BBHHHI", 0x42, 0x01, 0x0080, 4, 1, register), (address, _PORT))
             answer = link.recv(64)

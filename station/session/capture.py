@@ -13,7 +13,7 @@ import numpy as np
 from recordings.images import Pixels, viewable
 from recordings.schema.messages import Image, RobotState, Stamps, View
 from station.analysis.pool import WorkerError
-from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion
+from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.layout import flange_pose
@@ -26,7 +26,7 @@ SATURATED_LIMIT = 0.05
 TRIES = 3
 GAPS_S = (0.0, 0.0, 0.03)
 """Pauses before the images for motion; unequal between them, so that no vibration's period fits both."""
-WORKER_TIMEOUT_S = 5.0
+WORKER_TIMEOUT_S, DETECT_TIMEOUT_S = 5.0, 20.0
 
 log = logging.getLogger(__name__)
 
@@ -150,8 +150,11 @@ async def _write(context: SessionContext, index: int, image: Image, view: View, 
 
 async def _sighting(context: SessionContext, image: Image, index: int) -> BoardDetection | None:
     """Detect the board; None when the worker failed."""
+    config, pixels = context.cell.config, viewable(image.pixels, image.pixel_format)
     try:
-        return await context.look_at(image)
+        return await context.workers.call(
+            sight, pixels, config.board, config.camera.model, timeout_s=DETECT_TIMEOUT_S
+        )
     except WorkerError as error:
         context.store.problem(error, "warning", index, "the image was not checked: {}")
         return None

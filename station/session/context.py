@@ -12,12 +12,11 @@ from pathlib import Path
 import msgspec
 
 from recordings.errors import CodedError, RecordingError, Value
-from recordings.images import viewable
 from recordings.recorder import Recorder
 from recordings.recover import recover_recording
-from recordings.schema.messages import CameraModel, CaptureEvent, Image, RobotState, Stamps
+from recordings.schema.messages import CaptureEvent, RobotState, Stamps
 from station.analysis.pool import Workers
-from station.analysis.worker import BoardDetection, CapturedView, sight
+from station.analysis.worker import CapturedView
 from station.cell.errors import RefusedError
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
@@ -30,7 +29,6 @@ from station.session.threads import DISK
 
 log = logging.getLogger("station.events")
 
-_LOOK_S = 20.0
 EVENTS_KEPT = 100
 EVENT_TEXT_LIMIT = 400
 
@@ -130,14 +128,6 @@ class SessionContext:
                 for found in await self.workers.call(recover_recording, recording.folder):
                     self.store.event("recovered", f"recovered {found.text}")
             await DISK.run(recording.count_segments)
-
-    async def look_at(self, image: Image, lens: CameraModel | None = None) -> BoardDetection:
-        """Detect the board in an image; `lens`: None: the configured one. Raises WorkerError."""
-        config = self.cell.config
-        pixels = viewable(image.pixels, image.pixel_format)
-        return await self.workers.call(
-            sight, pixels, config.board, lens or config.camera.model, timeout_s=_LOOK_S
-        )
 
     def forget_session(self, check: bool = False) -> None:
         """Clear the last session from the status when a session begins; `check`: as a drift check."""

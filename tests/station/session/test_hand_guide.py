@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from typing import Any
-from unittest.mock import AsyncMock
+from unittest.mock import Mock
 
 import pytest
 
@@ -13,6 +13,7 @@ from station.analysis.pool import WorkerError
 from station.cell.config import vector6
 from station.cell.status import StationState as S
 from station.protocol.verbs import Skip
+from station.session import capture
 from tests.codes import raises
 from tests.patience import until
 from tests.station.operate.guided_views import guided_joints
@@ -103,8 +104,8 @@ async def test_what_could_not_be_checked_is_kept_only_for_who_asked(
     guided: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await until(lambda: captured(guided) == 1 and guided.state is S.FREE_DRIVE)
-    late = AsyncMock(side_effect=WorkerError("worker-late", function="sight"))
-    monkeypatch.setattr(guided.session.context, "look_at", late)
+    late = Mock(side_effect=WorkerError("worker-late", function="sight"))
+    monkeypatch.setattr(capture, "sight", late)
     lead(guided, guided_joints(TRUTH)[1])
     await until(lambda: guided.told("not-checked") and guided.state is S.FREE_DRIVE)
     assert guided.pose_states == ["done"]

@@ -72,17 +72,28 @@ class FrameTree:
             edge.numbers.extend(numbers)
 
     def chain(self, base: str, flange: str) -> list[tuple[tuple[str, str], bool]]:
-        """The edges from base to flange, each with whether it is walked from parent to child; [] if none."""
-        chains: dict[str, list[tuple[tuple[str, str], bool]]] = {base: []}
-        waiting = deque([base])
-        while waiting and flange not in chains:
-            name = waiting.popleft()
+        """The edges from base to flange, each with whether it is walked from parent to child; [] if none.
+
+        Up to a common parent, then down: never down to what two parents carry, such as a board, and up again.
+        """
+        up, down = self._above(base), self._above(flange)
+        common = [name for name in up if name in down]
+        if not common:
+            return []
+        top = min(common, key=lambda name: len(up[name]) + len(down[name]))
+        return [*((pair, False) for pair in up[top]), *((pair, True) for pair in reversed(down[top]))]
+
+    def _above(self, name: str) -> dict[str, list[tuple[str, str]]]:
+        """Frames above one, itself included, and the edges that lead up to each."""
+        found: dict[str, list[tuple[str, str]]] = {name: []}
+        waiting = deque([name])
+        while waiting:
+            child = waiting.popleft()
             for pair in self.edges:
-                for end, other in (pair, pair[::-1]):
-                    if end == name and other not in chains:
-                        chains[other] = [*chains[name], (pair, end == pair[0])]
-                        waiting.append(other)
-        return chains.get(flange, [])
+                if pair[1] == child and pair[0] not in found:
+                    found[pair[0]] = [*found[child], pair]
+                    waiting.append(pair[0])
+        return found
 
     def find(self, base: str | None, flange: str | None) -> tuple[str, str]:
         """The names of base and flange: as given, or the best known pair that a moving chain joins."""

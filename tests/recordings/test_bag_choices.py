@@ -101,19 +101,12 @@ def joints(names: tuple[str, ...], *positions: tuple[float, ...]) -> list[JointM
     return [JointMessage(n, names, q, (np.nan,) * len(q)) for n, q in enumerate(positions)]
 
 
-def test_joints_come_by_their_numbers() -> None:
-    names, q = (*ARM[::-1], "gripper"), (6.0, 5, 4, 3, 2, 1, 9)
-    track = chosen(__joints=joints(names, q)).joints
+def test_joints_come_by_their_numbers_and_what_is_no_number_is_passed_over() -> None:
+    names, q, nothing = (*ARM[::-1], "gripper"), (6.0, 5, 4, 3, 2, 1, 9), (np.nan,) * 7
+    track = chosen(__joints=joints(names, (), nothing, q)).joints
     assert track is not None
     np.testing.assert_array_equal(track.positions_rad, [[1, 2, 3, 4, 5, 6]])
-    assert track.speeds_rad_s is None, "no number is no speed"
+    assert track.speeds_rad_s is None
+    assert chosen(__joints=joints(names, (), nothing)).joints is None
     unnumbered = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
     assert chosen(__joints=joints(unnumbered, (1, 2, 3, 4, 5))).joints is None, "nothing says their order"
-
-
-def test_reports_without_joints_are_passed_over() -> None:
-    good, nothing = (1.0, 2, 3, 4, 5, 6), (np.nan,) * 6
-    track = chosen(__joints=joints(ARM, (), nothing, good)).joints
-    assert track is not None
-    np.testing.assert_array_equal(track.positions_rad, [good])
-    assert chosen(__joints=joints(ARM, (), nothing)).joints is None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -42,6 +44,15 @@ def test_a_chain_is_walked_against_its_arrows_too() -> None:
     np.testing.assert_allclose(T, A @ turned(0.045) @ B, atol=1e-12)
     back = tree.track("flange", "world").at(np.array([4500]))[0]
     np.testing.assert_allclose(back, np.linalg.inv(T), atol=1e-12)
+
+
+def test_a_board_seen_from_two_sides_joins_no_arm() -> None:
+    """Else the flange would be where an earlier calibration places it."""
+    tree, names = FrameTree(), ["base", "shoulder", "elbow", "wrist", "tool0"]
+    for n, link in enumerate([*pairwise(names), ("camera", "board")]):
+        tree.add([frame(t, *link, turned(0.1 * n * t)) for t in range(2)])
+    tree.add([frame(0, "tool0", "camera", random_pose(1)), frame(0, "base", "board", random_pose(2))])
+    assert [pair for pair, _ in tree.chain("base", "tool0")] == list(pairwise(names))
 
 
 def test_the_nearest_report_of_every_moving_link_counts() -> None:

@@ -89,15 +89,20 @@ def write_views(
     beside: dict[str, bytes],
     progress: Progress = lambda done, total, text: None,
 ) -> Imported:
-    """`import_folder` once everything is known; `beside`: attachments by name."""
+    """`import_folder` once everything is known; `beside`: attachments by name.
+
+    The date is that of the newest image: old images prove nothing of today, and those that a calibration was
+    made from are known again.
+    """
     if (camera := dataset.camera) is None:
         raise ImportSourceError("dataset-value", path=folder / DATASET_FILE, key="camera")
-    size = camera.width, camera.height
+    size, newest_ns = (camera.width, camera.height), 0
     for row in (row for row in rows if row.camera_from_board is None):
         _beginning(folder, row, size, _HEADER_BYTES)
+        newest_ns = max(newest_ns, (folder / row.image).stat().st_mtime_ns)
     if output is None:
         return Imported(folder, len(rows))
-    with derived_recording(output, dataset.session(folder, camera)) as writer:
+    with derived_recording(output, dataset.session(folder, camera, newest_ns)) as writer:
         for name, content in beside.items():
             writer.attach(name, _MEDIA[Path(name).suffix], content)
         for index, row in enumerate(rows):

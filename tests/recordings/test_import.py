@@ -53,6 +53,8 @@ def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None
     assert stored == ("png", (folder / "images/0.png").read_bytes())
     assert set(recording.attachments()) == {"dataset.yaml", "poses.csv", "kinematics.yaml"}
     assert done.images == 3
+    again = import_folder(folder, tmp_path / "again.mcap").path
+    assert open_recording(again).sha256 == recording.sha256, "no new views for a drift check"
     (folder / "images/0.png").unlink()  # of a folder that grows, old pictures may be gone
     newest = open_recording(import_folder(folder, tmp_path / "newest.mcap", newest=2).path)
     assert [v.source_file for v in newest.views()] == ["images/1.png", "images/2.png"]

@@ -17,7 +17,7 @@ from recordings.files import sync_folder
 from recordings.images import encode_png, mosaic_encoding, viewable
 from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
 from recordings.reader import Recording
-from recordings.schema.messages import View
+from recordings.schema.messages import ARM_KINEMATICS_NAME, UR_KINEMATICS_NAME, View
 from recordings.schema.viewing import quaternion_xyzw
 
 _EXTENSIONS = {"png": "png", "jpeg": "jpg"}
@@ -74,6 +74,9 @@ def _write_folder(recording: Recording, folder: Path) -> None:
         "note": info.note or f"exported from session {info.name} ({info.source})",
     }
     (folder / DATASET_FILE).write_bytes(msgspec.yaml.encode(described))
+    attached = recording.attachments()
+    for name in attached.keys() & {ARM_KINEMATICS_NAME, UR_KINEMATICS_NAME}:
+        (folder / name).write_bytes(attached[name])
 
 
 def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:

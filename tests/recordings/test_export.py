@@ -45,10 +45,12 @@ def test_a_folder_export_imports_as_the_same_views(small: Path, tmp_path: Path) 
 
 
 def test_an_imported_file_is_exported_byte_for_byte(folder: Path, tmp_path: Path) -> None:
+    (folder / "kinematics.yaml").write_bytes(b"kinematics: {}\n")
     recording = open_recording(import_folder(folder, tmp_path / "a.mcap").path)
     out = export_recording(recording, tmp_path / "out", "folder")
     for index in range(3):
         assert (out / f"images/{index:03d}.png").read_bytes() == (folder / f"images/{index}.png").read_bytes()
+    assert (out / "kinematics.yaml").read_bytes() == b"kinematics: {}\n", "the arm's own table"
 
 
 def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: Path) -> None:

@@ -74,7 +74,11 @@ def run_batch(
     options = options or JobOptions()
     try:
         output.mkdir(parents=True, exist_ok=True)
-        done = {result.key: result for result in read_lines(output / RESULTS, BatchResult) if result.solved}
+        done = {
+            result.key: result
+            for result in read_lines(output / RESULTS, BatchResult)
+            if result.solved and (output / result.calibration).exists()
+        }
         tasks = [(os.path.realpath(path), batch_key(path, options)) for path in recordings]
         todo = [task for task in dict.fromkeys(tasks) if task[1] not in done]
         work = partial(solve_one, options=options, limits=limits or Limits())

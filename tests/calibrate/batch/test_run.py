@@ -107,6 +107,9 @@ def test_it_goes_on_where_it_was_killed(recordings: list[Path], tmp_path: Path) 
     assert all(result.solved for result in results)
     assert len(run_batch(recordings, tmp_path / "out", workers=counted)) == 3
     assert len(counted.asked) == 2
+    (tmp_path / "out" / results[0].calibration).unlink()
+    run_batch(recordings, tmp_path / "out", workers=counted)
+    assert (tmp_path / "out" / results[0].calibration).exists(), "a result that is gone is made again"
 
 
 def test_other_options_or_a_changed_recording_are_solved_again(

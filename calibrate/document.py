@@ -5,8 +5,6 @@ from __future__ import annotations
 import platform
 import sys
 from datetime import UTC, datetime
-from functools import cache
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -42,6 +40,7 @@ from calibrate.views import ViewSet
 from recordings.plain_text import plain_text
 from recordings.reader import Recording
 from recordings.schema.messages import BoardKind
+from recordings.software import software_versions
 
 _PACKAGES = ("calibration-station", "numpy", "scipy", "opencv-python-headless", "clarabel")
 _DEG = float(np.degrees(1.0))
@@ -88,7 +87,7 @@ def make_calibration(
             recording=plain_text(recording.path.name),
             recording_sha256=recording.sha256,
             session=info.name,
-            software=software_versions(),
+            software=solver_software(),
             profile=solution.profile,
             seed=solution.seed,
             options=options,
@@ -130,16 +129,9 @@ def _held_out(missed_m: Array) -> HeldOutViews:
     return HeldOutViews(as_it_is, corrected, int(np.isfinite(missed_m[0]).sum()))
 
 
-@cache
-def software_versions() -> dict[str, str]:
-    """Python, machine and the packages that a result depends on."""
-    found = {"python": platform.python_version(), "machine": f"{sys.platform} {platform.machine()}"}
-    for name in _PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed as a package"
-    return found
+def solver_software() -> dict[str, str]:
+    """Machine, Python and the packages that a result depends on."""
+    return {**software_versions(*_PACKAGES), "machine": f"{sys.platform} {platform.machine()}"}
 
 
 def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> Lens:

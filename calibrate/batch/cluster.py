@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, R, T
-from calibrate.document import software_versions
+from calibrate.document import solver_software
 from calibrate.errors import UsageError
 
 _CONNECT_S = 30
@@ -77,9 +77,9 @@ def _connect(dask: Any, address: str) -> Any:
 
 def _require_same_software(client: Any, address: str) -> None:
     """Other versions give other bits: refused before anything is solved."""
-    here = software_versions()
+    here = solver_software()
     try:
-        there: dict[str, dict[str, str]] = client.run(software_versions)
+        there: dict[str, dict[str, str]] = client.run(solver_software)
     except Exception as problem:  # whatever a worker without this package raises
         raise BatchError(
             "cluster-software", address=address, why=f"a worker cannot run this package ({problem})"

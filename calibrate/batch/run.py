@@ -14,7 +14,7 @@ import cv2
 import msgspec
 
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
-from calibrate.document import software_versions
+from calibrate.document import solver_software
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration, write_output
 from calibrate.files.integrity import content_sha256
@@ -111,7 +111,7 @@ def batch_key(recording: Path, options: JobOptions) -> str:
             stat = file.stat()
             found.append((os.fsencode(os.path.realpath(file)), stat.st_size, stat.st_mtime_ns))
     chosen = {name: msgspec.to_builtins(value) for name, value in vars(options).items() if name != "threads"}
-    parts = [found, chosen, software_versions()]
+    parts = [found, chosen, solver_software()]
     return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()[:24]
 
 

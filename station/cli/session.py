@@ -24,7 +24,6 @@ from station.cell.socket_folder import default_socket
 from station.cell.status import CHECK_VIEWS, MotionPreview, StationState, StationStatus
 from station.cli.console import AsJson, Headless, Socket, err, out, print_json
 from station.operate.drift_check import check_arguments, judged, start_drift_check
-from station.operate.ending import after_capture
 from station.operate.motion import (
     HASH_DIGITS,
     Watcher,
@@ -34,6 +33,7 @@ from station.operate.motion import (
     wait_until_idle,
     watched,
 )
+from station.operate.next_step import after_capture
 from station.plan.files import load_plan
 from station.protocol.client import Client
 from station.protocol.verbs import LoadPlan, Prepare, Purpose, Stop

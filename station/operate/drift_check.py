@@ -7,8 +7,8 @@ from pathlib import Path
 from calibrate.check.history import read_checks
 from calibrate.files.install import installed_calibration
 from station.cell.status import CHECK_VIEWS, SessionStatus, StationState, StationStatus
-from station.operate.ending import Ending, after_drift_check
 from station.operate.motion import PREPARE_S, Approve, prepared_motion
+from station.operate.next_step import NextStep, after_drift_check
 from station.protocol.client import Client
 from station.protocol.verbs import Freedrive, GetPlan, LoadPlan, MakePlan, Prepare, Purpose
 
@@ -63,7 +63,7 @@ async def recorded(link: Client, before: str) -> SessionStatus | None:
     return None
 
 
-def judged(folder: str, camera: str) -> Ending | None:
+def judged(folder: str, camera: str) -> NextStep | None:
     """Judge this session's drift check and say what to do after it; None: it was not judged."""
     path = Path(folder).resolve()
     history = read_checks(path.parents[1], camera)

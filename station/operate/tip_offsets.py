@@ -28,7 +28,7 @@ from station.cell.config import Vector3
 from station.cell.errors import RefusedError
 from station.cell.layout import flange_pose
 from station.cell.status import StationStatus
-from station.operate.ending import after_touches
+from station.operate.next_step import after_touches
 from station.protocol.client import Client
 from station.protocol.verbs import Observe
 

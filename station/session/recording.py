@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import platform
 import threading
 import time
 from collections.abc import Coroutine
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,6 +18,7 @@ from recordings.files import EMPTY_SUFFIX, MAIN_CAMERA, PART_SUFFIX, require_fre
 from recordings.manifest import enter_part, read_manifest
 from recordings.recorder import Recorder
 from recordings.schema.messages import ARM_KINEMATICS_NAME, CameraModel, Image, Matrix4, SessionInfo, Stamps
+from recordings.software import software_versions
 from station.cell.config import matrix4
 from station.cell.errors import CameraError
 from station.cell.layout import guess_matrix
@@ -43,18 +41,6 @@ _PACKAGES = (
 SYNC_TIMEOUT_S = 30.0
 
 R = TypeVar("R")
-
-
-@cache
-def software() -> dict[str, str]:
-    """List the versions of the software that takes part in a capture."""
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "absent"
-    return found
 
 
 async def to_the_end(work: Coroutine[object, object, R]) -> R:
@@ -159,7 +145,7 @@ class SessionRecording:
             created_wall_ns=time.time_ns(),
             plan_sha256=plan_sha256,
             config_sha256=self._cell.config_sha256,
-            software=software()
+            software=software_versions(*_PACKAGES)
             | {"robot control": (mover.control_path if (mover := self._cell.mover) else "") or "none"}
             | ({"robot stops": stops} if (stops := self._cell.acceptance_trouble(self._root)) else {}),
         )

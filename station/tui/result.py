@@ -24,7 +24,7 @@ from calibrate.files.versions import same_solve
 from calibrate.results import Gate
 from recordings.cli.console import open_in_browser
 from station.cell.session_folder import REPORT_FILE
-from station.operate.ending import Way, after_drift_check, after_solve
+from station.operate.next_step import StepKind, after_drift_check, after_solve
 from station.tui.installed import Result, local
 from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
@@ -84,9 +84,9 @@ def _to_do(result: Result, calibration: Calibration) -> Iterator[str]:
         yield f"Override by {taken.who}: “{taken.reason}”"
         return
     objections = () if result.installed else result.objections
-    end = after_solve(calibration, objections)
-    if end.way is not Way.INSTALL and end.text not in objections:
-        yield str(end)
+    step = after_solve(calibration, objections)
+    if step.kind is not StepKind.INSTALL and step.text not in objections:
+        yield str(step)
     yield from (f"▲ {objection}" for objection in objections)
 
 
@@ -101,11 +101,11 @@ def check_rows(result: Result, calibration: Calibration) -> list[Row]:
         kind: Mark = "done" if agrees(touch) else "failed"
         rows.append(_row(kind, name, f"{sigmas:.1f} σ", sigmas, LIMIT_SIGMAS, "≤ 3.0 σ", touch_text(touch)))
     for entry in reversed(result.state.drift if result.installed else ()):
-        end = after_drift_check(entry)
-        kind = "failed" if not entry.passed else "done" if end.way is Way.KEEP else "look"
+        step = after_drift_check(entry)
+        kind = "failed" if not entry.passed else "done" if step.kind is StepKind.KEEP else "look"
         name = time.strftime("drift check %d %b", time.localtime(entry.wall_s))
         value = f"{1000 * float(np.linalg.norm(entry.shift[:3])):.2f} mm"
-        rows.append(_row(kind, name, value, entry.statistic, entry.threshold, text=str(end)))
+        rows.append(_row(kind, name, value, entry.statistic, entry.threshold, text=str(step)))
     return rows
 
 

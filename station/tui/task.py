@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from station.cell.config import StationConfig
 from station.cell.status import NO_IMAGE, DetectionStatus, GuidanceStatus, StationState, StationStatus
-from station.operate.ending import Way, after_solve
+from station.operate.next_step import StepKind, after_solve
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
 from station.tui.installed import Kept, Result
@@ -280,15 +280,15 @@ def _with_result(result: Result, status: StationStatus) -> Action:
     calibration = result.calibration
     if calibration is None:
         return Action("5", "Choose a session", result.problem, look=True)
-    end = after_solve(calibration, () if result.installed else result.objections)
+    step = after_solve(calibration, () if result.installed else result.objections)
     if result.state.withdrawn and result.installed:
         why = "Withdrawn: programs are refused this one. i on 4 installs it again."
         return Action("n", "Plan 25 poses", why, at="plan", look=True)
     if result.installed:
         return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="result")
-    if end.way is Way.INSTALL:
+    if step.kind is StepKind.INSTALL:
         touch = "" if calibration.verification or status.simulated else " Or h: a touch test first."
-        return Action("i", "Install", f"PASS: {end.text}.{touch}", at="result")
-    if end.way is Way.RETAKE:
-        return Action("n", "Plan and retake", end.text, at="plan", look=True)
-    return Action("4", "See what failed", f"Look for: {end.text}", look=True)
+        return Action("i", "Install", f"PASS: {step.text}.{touch}", at="result")
+    if step.kind is StepKind.RETAKE:
+        return Action("n", "Plan and retake", step.text, at="plan", look=True)
+    return Action("4", "See what failed", f"Look for: {step.text}", look=True)

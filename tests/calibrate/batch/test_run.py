@@ -120,7 +120,7 @@ def test_other_options_or_a_changed_recording_are_solved_again(
     assert key != batch_key(recordings[0], JobOptions(seed=1))
     assert key != batch_key(recordings[1], JobOptions())
     with monkeypatch.context() as patch:
-        patch.setattr("calibrate.batch.run.software_versions", lambda: {"calibration-station": "0.0.1"})
+        patch.setattr("calibrate.batch.run.solver_software", lambda: {"calibration-station": "0.0.1"})
         assert key != batch_key(recordings[0], JobOptions())
     os.utime(recordings[0], (1, 1))
     assert key != batch_key(recordings[0], JobOptions())

@@ -12,7 +12,7 @@ from calibrate.files.touch import Touch, agrees, touch_sigmas
 from station.cell.status import SessionStatus
 
 
-class Way(StrEnum):
+class StepKind(StrEnum):
     """Next step after a procedure."""
 
     SOLVE = "solve"
@@ -23,63 +23,64 @@ class Way(StrEnum):
 
 
 @dataclass(frozen=True)
-class Ending:
+class NextStep:
     """Recommended next step, with its reason."""
 
-    way: Way
+    kind: StepKind
     text: str
 
     def __str__(self) -> str:
-        return f"{self.way.value.capitalize()}: {self.text}"
+        return f"{self.kind.value.capitalize()}: {self.text}"
 
 
-def after_capture(session: SessionStatus) -> Ending:
+def after_capture(session: SessionStatus) -> NextStep:
     """Recommend a step after a finished or paused session."""
     failed = [str(pose.index + 1) for pose in session.poses if pose.state == "failed"]
     if failed:
         causes = {pose.reason for pose in session.poses if pose.state == "failed" and pose.reason}
         why = f" ({'; '.join(sorted(causes)[:2])})" if causes else ""
-        return Ending(Way.RETAKE, f"pose {', '.join(failed)} was not captured{why}")
+        return NextStep(StepKind.RETAKE, f"pose {', '.join(failed)} was not captured{why}")
     if session.check:
-        return Ending(Way.SOLVE, "the drift check judges the installed calibration by this recording")
-    return Ending(Way.SOLVE, "the recording is finished")
+        return NextStep(StepKind.SOLVE, "the drift check judges the installed calibration by this recording")
+    return NextStep(StepKind.SOLVE, "the recording is finished")
 
 
-def after_solve(calibration: Calibration, objections: Sequence[str] = ()) -> Ending:
+def after_solve(calibration: Calibration, objections: Sequence[str] = ()) -> NextStep:
     """Recommend a step after solving; `objections`: further points for which installing asks a reason."""
     quality, rejected = calibration.quality, calibration.views.rejected
     if quality.failed:
         gate = quality.failed[0]
         if rejected and gate.name in ("weight", "views"):
             numbers = ", ".join(str(view.index + 1) for view in rejected)
-            return Ending(Way.RETAKE, f"view {numbers}. {rejected[0].reason}")
-        return Ending(Way.LOOK_FOR, gate.remedy or gate.text)
+            return NextStep(StepKind.RETAKE, f"view {numbers}. {rejected[0].reason}")
+        return NextStep(StepKind.LOOK_FOR, gate.remedy or gate.text)
     if failed := [touch for touch in calibration.verification if not agrees(touch)]:
         return after_touches(failed)
     if objections:
-        return Ending(Way.LOOK_FOR, objections[0])
-    return Ending(Way.INSTALL, f"all {len(quality.gates)} gates passed")
+        return NextStep(StepKind.LOOK_FOR, objections[0])
+    return NextStep(StepKind.INSTALL, f"all {len(quality.gates)} gates passed")
 
 
-def after_touches(touches: Sequence[Touch]) -> Ending:
+def after_touches(touches: Sequence[Touch]) -> NextStep:
     """Recommend a step after a touch test."""
     off = [touch for touch in touches if not agrees(touch)]
     if not off:
-        return Ending(Way.INSTALL, f"the tip met {len(touches)} corners as predicted")
+        return NextStep(StepKind.INSTALL, f"the tip met {len(touches)} corners as predicted")
     worst = max(off, key=touch_sigmas)
-    return Ending(
-        Way.LOOK_FOR,
+    return NextStep(
+        StepKind.LOOK_FOR,
         f"a wrong pointer length or tool, or a board that was moved: the tip stood "
         f"{max(map(abs, worst.offset_mm)):.1f} mm beside corner {worst.corner}",
     )
 
 
-def after_drift_check(entry: CheckEntry) -> Ending:
+def after_drift_check(entry: CheckEntry) -> NextStep:
     """Recommend a step after a drift check."""
     if entry.trend is not None:
-        return Ending(Way.LOOK_FOR, entry.trend.text)
+        return NextStep(StepKind.LOOK_FOR, entry.trend.text)
     if entry.passed:
-        return Ending(Way.KEEP, "the installed calibration holds")
-    return Ending(
-        Way.LOOK_FOR, "a loose camera or board mount. Tighten it, then capture and install a new calibration"
+        return NextStep(StepKind.KEEP, "the installed calibration holds")
+    return NextStep(
+        StepKind.LOOK_FOR,
+        "a loose camera or board mount. Tighten it, then capture and install a new calibration",
     )

@@ -11,7 +11,7 @@ from calibrate.files.touch import Touch
 from calibrate.results import Gate
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import PoseStatus, SessionStatus
-from station.operate.ending import Way, after_capture, after_drift_check, after_solve
+from station.operate.next_step import StepKind, after_capture, after_drift_check, after_solve
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
 
@@ -29,19 +29,19 @@ def failed(*names: str, rejected: tuple[RejectedView, ...] = ()) -> Calibration:
 
 
 @pytest.mark.parametrize(
-    ("calibration", "objections", "way"),
+    ("calibration", "objections", "kind"),
     [
-        (GOOD, (), Way.INSTALL),
-        (GOOD, ("less certain than the installed one",), Way.LOOK_FOR),
-        (failed("predicted_error_m"), (), Way.LOOK_FOR),
-        (failed("weight", rejected=(REJECTED,)), (), Way.RETAKE),
-        (failed("coverage", rejected=(REJECTED,)), (), Way.LOOK_FOR),
-        (msgspec.structs.replace(GOOD, verification=[HIT]), (), Way.INSTALL),
-        (msgspec.structs.replace(GOOD, verification=[HIT, MISS]), (), Way.LOOK_FOR),
+        (GOOD, (), StepKind.INSTALL),
+        (GOOD, ("less certain than the installed one",), StepKind.LOOK_FOR),
+        (failed("predicted_error_m"), (), StepKind.LOOK_FOR),
+        (failed("weight", rejected=(REJECTED,)), (), StepKind.RETAKE),
+        (failed("coverage", rejected=(REJECTED,)), (), StepKind.LOOK_FOR),
+        (msgspec.structs.replace(GOOD, verification=[HIT]), (), StepKind.INSTALL),
+        (msgspec.structs.replace(GOOD, verification=[HIT, MISS]), (), StepKind.LOOK_FOR),
     ],
 )
-def test_a_solve(calibration: Calibration, objections: tuple[str, ...], way: Way) -> None:
-    assert after_solve(calibration, objections).way is way
+def test_a_solve(calibration: Calibration, objections: tuple[str, ...], kind: StepKind) -> None:
+    assert after_solve(calibration, objections).kind is kind
 
 
 def test_a_retake_names_the_view_as_screens_count() -> None:
@@ -52,14 +52,14 @@ def test_a_retake_names_the_view_as_screens_count() -> None:
 def test_a_capture() -> None:
     saved = PoseStatus(0, "p01", state="done")
     missed = PoseStatus(1, "p02", state="failed", reason="the board is not seen")
-    assert after_capture(SessionStatus(poses=(saved,), recording="/r")).way is Way.SOLVE
-    end = after_capture(SessionStatus(poses=(saved, missed), recording="/r"))
-    assert end.way is Way.RETAKE and "2" in end.text and missed.reason in end.text
+    assert after_capture(SessionStatus(poses=(saved,), recording="/r")).kind is StepKind.SOLVE
+    step = after_capture(SessionStatus(poses=(saved, missed), recording="/r"))
+    assert step.kind is StepKind.RETAKE and "2" in step.text and missed.reason in step.text
 
 
 def test_a_drift_check() -> None:
     entry = CheckEntry(0.0, 1, "r", True, (0.0,) * 6, 1.0, 12.6)
-    assert after_drift_check(entry).way is Way.KEEP
+    assert after_drift_check(entry).kind is StepKind.KEEP
     wanders = msgspec.structs.replace(entry, trend=Trend(0.4, 0.0, 40.0, 8))
-    assert after_drift_check(wanders).way is Way.LOOK_FOR
-    assert after_drift_check(msgspec.structs.replace(entry, passed=False)).way is Way.LOOK_FOR
+    assert after_drift_check(wanders).kind is StepKind.LOOK_FOR
+    assert after_drift_check(msgspec.structs.replace(entry, passed=False)).kind is StepKind.LOOK_FOR

@@ -53,10 +53,13 @@ class CornerModes:
         """(g,) sum over the views."""
         return np.asarray(self.free.right.sum(axis=0))
 
-    def gain(self, step: Array) -> float:
-        """Compute half the decrease of the sum of squares (px²) by a step (G,)."""
-        x = step[self.shared]
-        return float(self.right @ x - 0.5 * x @ self.information @ x)
+    def cost(self, step: Array) -> float:
+        """Compute half the squares (px²) after a step (G,), above those of the best lens and shape."""
+        right = self.right - self.information @ step[self.shared]
+        scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->i", self.whole), 1e-300))
+        scaled = self.information * np.outer(scale, scale)
+        to_best = np.linalg.lstsq(scaled, scale * right, rcond=1e-9)[0]
+        return 0.5 * float(right @ (scale * to_best))
 
     @cached_property
     def _whitening(self) -> tuple[Array, float]:

@@ -45,7 +45,8 @@ class LinearSolution:
     z: Array
     """(n, K, 6) S_k⁻¹ m at the step's end."""
     log_evidence: float
-    """Log evidence of the robot residuals, up to a constant of the linearisation (Laplace)."""
+    """Log evidence (Laplace) of the robot's residuals, and of the corners' above those of the best lens and
+    shape; up to a constant."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +134,7 @@ class Linear:
             float(log_density.sum()) + prior.log + prior.gain(step) - 0.5 * float(np.linalg.slogdet(N)[1])
         )
         if modes is not None:
-            evidence += modes.gain(step) / scales.lambda_px**2
+            evidence -= modes.cost(step) / scales.lambda_px**2
         return LinearSolution(step, N, scales, chances, residual, z, evidence)
 
     def noise(self, scales: Scales) -> tuple[Array, Array]:

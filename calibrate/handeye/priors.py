@@ -112,7 +112,7 @@ class Priors:
         N[fx : fy + 1, fx : fy + 1] += np.outer(slope, slope)
         right[fx : fy + 1] -= slope * miss
         # Constants are left out, except what differs between sizes of the arm's errors.
-        log = -0.5 * float(((errors / errors_sigma) ** 2).sum()) - float(np.log(errors_sigma).sum())
+        log = -0.5 * float(((value / sigma) ** 2).sum() + miss**2) - float(np.log(errors_sigma).sum())
         return Quadratic(N, right, log)
 
 
@@ -138,5 +138,6 @@ class KnownBefore:
         at = Layout.of(state)
         N, right, places = np.zeros((at.size, at.size)), np.zeros(at.size), at.all_but_board
         N[np.ix_(places, places)] = self.information
-        right[places] = -self.information @ self.away(state)
-        return Quadratic(N, right)
+        away = self.away(state)
+        right[places] = -self.information @ away
+        return Quadratic(N, right, -0.5 * float(away @ self.information @ away))

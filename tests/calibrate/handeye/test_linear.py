@@ -137,3 +137,19 @@ def test_an_unclear_view_costs_information_but_never_more_than_it_tells():
         lost = linear.lost(solved)
         assert np.linalg.eigvalsh(lost).min() > -1e-6 * np.abs(lost).max()
         assert (np.diag(linear.covariance(solved)) >= np.diag(np.linalg.inv(solved.precision)) * 0.999).all()
+
+
+@MOUNTS
+def test_the_evidence_is_that_of_the_views_not_of_where_they_are_linearised(mount):
+    """Estimates from two starts end at two lenses, whose priors and corners cost unlike much."""
+    cell = make_cell(np.random.default_rng(5), 12, MID, mount=mount)
+    observed, priors = observe_views(cell.views), Priors(LensPrior.given(cell.camera), BoardTolerance())
+    scales = Scales(np.array([3e-4, 5e-4]), 0.3, 0.25, 0.2, ONE_CLASS)
+    away = np.zeros(Layout.of(true_state(cell)).size)
+    found = []
+    for focal_px, bend_m in ((0.0, 0.0), (1.5, 0.0), (0.0, 1e-4)):
+        away[Layout.of(true_state(cell)).lens][:2], away[-1] = focal_px, bend_m
+        state = true_state(cell).moved(away, np.zeros((12, 6)))
+        linear = Linear.at(observed, state, observed.present)
+        found.append(linear.solve(priors.linearise(state, 0.0), scales, "nothing").log_evidence)
+    assert found == pytest.approx([found[0]] * 3, abs=0.05)

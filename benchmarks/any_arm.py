@@ -50,8 +50,8 @@ def line(case: tuple[str, Mount, float], cells: list[tuple[float, ...]]) -> list
 def measure(task: tuple[str, Mount, float, int]) -> tuple[float, ...]:
     cell = arm_cell(*task)
     learned, plain = (
-        solve_views(cell.views, SolveOptions(holdout=False, folds=False, model_arm=arm))
-        for arm in (True, False)
+        solve_views(views, SolveOptions(holdout=False, folds=False))
+        for views in (cell.views, arm_cell(*task, joints=False).views)
     )
     miss, plain_miss = (Miss.of(solution, cell.X) for solution in (learned, plain))
     assert learned.arm is not None and learned.arm.uncorrected is not None

@@ -92,7 +92,8 @@ def _errors(views: ViewSet, board: BoardSpec | None, out: Places, rest: Places) 
             training = solve_pnp(training, board)
         options = SolveOptions(intrinsics_from_same_pictures=free, holdout=False, folds=False)
         joined = solve_views(training, options)
-        alone = solve_views(training, replace(options, model_arm=False))
+        bare = tuple(replace(view, joints_rad=None) for view in training)
+        alone = solve_views(replace(training, views=bare), options)
         seen = views if board is None else solve_pnp(replace(views, camera=joined.camera), board)
     assert joined.arm is not None and joined.arm.result is not None and joined.arm.uncorrected is not None
     told, corrected = (

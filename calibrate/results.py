@@ -181,7 +181,8 @@ class Posterior(msgspec.Struct, frozen=True, omit_defaults=True):
     shape: list[float]
     """As `SHAPE`."""
     errors: list[float]
-    """Of the arm's links where `arm` is given, and of the bracket; metres and radians."""
+    """Of the arm's links where `arm` is given, else of its flange (`flange_extent_m`), and of the bracket;
+    metres and radians."""
     covariance_lower: list[float]
     """Of [X (δt, δφ), lens, shape, errors]: the lower triangle, row by row."""
     robot_noise: tuple[float, float]
@@ -195,13 +196,17 @@ class Posterior(msgspec.Struct, frozen=True, omit_defaults=True):
     board_extent_m: tuple[tuple[float, ...], ...]
     """Middle and half size of the corners seen, to which the bends of `shape` refer."""
     arm: LearnedArm | None = None
-    """None: the arm's errors are not known, or inside X's covariance."""
+    """None: the joints were not recorded, or the arm's errors are not in `errors`."""
     stated_arm_error: tuple[tuple[float, ...], ...] | None = None
     """Covariance (6, 6) of X by the stated error of the robot: one in the fit, another in every check."""
     level: tuple[float, ...] | None = None
     """Mean direction of gravity in the flange, to which X belongs; None: no bracket's bend in `errors`."""
     gravity: tuple[float, ...] | None = None
     """`level` in earlier files, where the bracket's `errors` have the other sign."""
+    flange_extent_m: tuple[float, ...] | None = None
+    """Mean place of the flange and its rms distance from there, by which a flange's smooth errors go."""
+    without_joints: Posterior | None = None
+    """The same for views whose joints are not known, where `arm` is given."""
 
 
 SHAPE = ("scale", "anisotropy", "bend xx", "bend yy", "bend xy")

@@ -89,11 +89,12 @@ def known_cell(calibration: Calibration, board: BoardSpec | None = None) -> Know
     Raises BadViewsError for one that states no noise.
     """
     camera = calibration.intrinsics.model
-    if calibration.posterior is not None:
-        told = (calibration.transform.matrix, np.array(calibration.covariance))
-        known = replace(KnownCell.of(calibration.posterior, camera), installed=told)
-    else:
+    if calibration.posterior is None:
         known = stated_cell(calibration)
+    else:
+        known = KnownCell.of(calibration.posterior, camera)
+        if known.chain is not None and known.without_joints is None:  # an earlier file
+            known = replace(known, without_joints=stated_cell(calibration))
     if board is None or board == calibration.board:
         return known
     return known.with_board(BoardTolerance.of(board))

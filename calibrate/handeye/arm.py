@@ -93,14 +93,20 @@ def flex_motion(flange: Array, level: Array | None = None) -> Array:
     return np.concatenate([np.zeros_like(turn), turn], axis=1)
 
 
-def smooth_motion(flange: Array) -> Array:
+def flange_extent(flange: Array) -> Array:
+    """Compute the mean place of the flange and its rms distance from there (4,), metres."""
+    middle = flange[:, :3, 3].mean(axis=0)
+    away = np.sqrt(((flange[:, :3, 3] - middle) ** 2).sum(axis=1).mean())
+    return np.append(middle, max(float(away), 1e-9))
+
+
+def smooth_motion(flange: Array, extent: Array) -> Array:
     """Compute the motion (n, 6, 54) of the flange, in base, by the errors of an arm of unknown kinematics.
 
-    Shift and turn are polynomials of second degree of the flange's position, whose rms distance from its mean
-    is the unit: three shifts, then three turns, for each of the nine terms.
+    Shift and turn are polynomials of second degree of the flange's position in `extent` (4,), as of
+    `flange_extent`: three shifts, then three turns, for each of the nine terms.
     """
-    place = flange[:, :3, 3] - flange[:, :3, 3].mean(axis=0)
-    place = place / max(float(np.sqrt((place**2).sum(axis=1).mean())), 1e-9)
+    place = (flange[:, :3, 3] - extent[:3]) / extent[3]
     i, j = np.triu_indices(3)
     terms = np.concatenate([place, place[:, i] * place[:, j]], axis=1)
     return np.asarray(np.einsum("nk,ab->nakb", terms, np.eye(6)).reshape(len(flange), 6, -1))

@@ -14,8 +14,7 @@ from functools import partial
 import numpy as np
 from scipy import special
 
-from calibrate.geometry import Array
-from calibrate.handeye.arm import smooth_motion
+from calibrate.geometry import Array, difference
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import Estimate, MeanParts, corner_weights, is_settled
 from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
@@ -44,14 +43,10 @@ Sizes = tuple[int, int, int]
 class _Sizes:
     """All combinations of sizes, and the prior of the errors for each."""
 
-    def __init__(self, links: int, bends: int, known: Array | None = None) -> None:
-        """Take the numbers of the links' errors (each has 3 shifts, then 3 turns) and of the bracket's.
-
-        known: 1σ (k,) of further errors, mm and mrad, after these.
-        """
+    def __init__(self, links: int, bends: int) -> None:
+        """Take the numbers of the links' errors (each has 3 shifts, then 3 turns) and of the bracket's."""
         self.kinds = np.repeat([*np.tile([0, 1], links // 6), 2], [*np.full(links // 3, 3), bends])
         """(q,) size that an error goes by, as a place in `Sizes`: 0 shift, 1 turn, 2 bend."""
-        self.known = np.zeros(0) if known is None else known
         size = len(SIZES) if links else 1
         self.shape = (size, size, len(BENDS) if bends else 1)
 
@@ -59,7 +54,7 @@ class _Sizes:
         """1σ (q,) of each error, mm and mrad."""
         shift, turn, bend = one
         sizes = np.array([SIZES[shift], SIZES[turn], BENDS[bend]])
-        return np.append(np.maximum(sizes[self.kinds], _NONE), self.known)
+        return np.asarray(np.maximum(sizes[self.kinds], _NONE))
 
     def log_chance(self, one: Sizes) -> float:
         """Log probability of a combination."""
@@ -135,23 +130,13 @@ def estimate_with_arm_errors(
     return with_errors, log_bayes
 
 
-def unknown_arm_covariance(observed: Observations, found: Estimate, priors: Priors) -> Array:
-    """Compute what errors of an arm of unknown kinematics add to the covariance (6, 6) of X.
+def unknown_arm_covariance(found: Estimate, smooth: Estimate) -> Array:
+    """Compute what smooth errors of the flange add to the covariance (6, 6) of X.
 
-    X stays where it fits the flanges as they are told. With a flange that errs smoothly (`smooth_motion`) its
-    mean is elsewhere: that distance counts as error. The bracket's bends are as large as `found` has them.
-    LinAlgError where the views leave it open.
+    X stays where it fits the flanges as they are told. Its distance from the mean with errors is error.
     """
-    motion, bends = smooth_motion(observed.flange), observed.by_arm_errors
-    sizes = _Sizes(motion.shape[2], 0, found.scales.arm_error_sigma)
-    state = replace(found.state, arm_errors=np.append(np.zeros(motion.shape[2]), found.state.arm_errors))
-    both = replace(observed, by_arm_errors=np.concatenate([motion, bends], axis=2))
-    linear = Linear.at(both, state, found.corner_weights)
-    kept = _explore(sizes, partial(_solve, linear, priors, state), found.scales)
-    chances = special.softmax([sizes.log_chance(one) + each.log_evidence for one, each in kept.items()])
-    added = -found.covariance[:6, :6]
-    for chance, each in zip(chances, kept.values(), strict=True):
-        added = added + chance * (linear.covariance(each)[:6, :6] + np.outer(each.step[:6], each.step[:6]))
+    off = difference(smooth.state.X, found.state.X)
+    added = smooth.covariance[:6, :6] + np.outer(off, off) - found.covariance[:6, :6]
     values, vectors = np.linalg.eigh((added + added.T) / 2)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 

@@ -174,6 +174,8 @@ class CellFit:
     """None where errors of the arm's links are not among them."""
     plain: Estimate
     """The estimate without systematic errors of arm and bracket."""
+    smooth: Estimate | None
+    """The estimate for flanges that err smoothly, whatever the joints say; None as `log_bayes`."""
     pairs: Pairs
     """Pairs of the views that count."""
     certified: GlobalResult

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibrate.errors import PosesDisagreeError
 from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
-from calibrate.handeye.arm import arm_postures, flex_motion
+from calibrate.handeye.arm import arm_postures, flange_extent, flex_motion, smooth_motion
 from calibrate.handeye.arm_fit import estimate_with_arm_errors, unknown_arm_covariance
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
@@ -35,10 +35,10 @@ MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
 """Above this robot noise (1σ per axis, metres and radians) the poses are refused."""
 
 
-def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) -> CellFit:
+def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
     """Estimate all unknowns of a cell from views with their board poses.
 
-    model_arm: also errors of arm and bracket, from `FEWEST_FOR_ARM_ERRORS` views on. Raises BadViewsError or
+    Errors of arm and bracket are among them from `FEWEST_FOR_ARM_ERRORS` views on. Raises BadViewsError or
     DegenerateMotionError where X is not determined, PosesDisagreeError where the noise is beyond its limits.
     """
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
@@ -53,26 +53,29 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
     STAGES.info("2 of 4: camera, board and lens together")
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
-    log_bayes, plain, failure, unknown = None, found, "", np.zeros((6, 6))
-    arm, joints_note = arm_postures(views) if model_arm else (None, "")
-    if model_arm and len(views) >= FEWEST_FOR_ARM_ERRORS:
+    log_bayes, plain, failure, unknown, smooth = None, found, "", np.zeros((6, 6)), None
+    arm, joints_note = arm_postures(views)
+    if len(views) >= FEWEST_FOR_ARM_ERRORS:
         flex = flex_motion(views.base_from_flange)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
         STAGES.info("3 of 4: errors of the arm")
         modelled = replace(observed, by_arm_errors=np.concatenate([links, flex], axis=2))
         try:
             allowed, evidence = estimate_with_arm_errors(modelled, found, priors, links.shape[2])
+            columns = smooth_motion(observed.flange, flange_extent(observed.flange))
+            both = replace(observed, by_arm_errors=np.concatenate([columns, flex], axis=2))
+            as_told, _ = estimate_with_arm_errors(both, plain, priors, columns.shape[2])
             if arm is None:
-                unknown = unknown_arm_covariance(modelled, allowed, priors)
-            found, log_bayes, observed = allowed, evidence, modelled
+                unknown = unknown_arm_covariance(allowed, as_told)
+            found, log_bayes, observed, smooth = allowed, evidence, modelled, as_told
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used))
     require_motion(pairs)  # a wrong view may have been the only one about a second axis
     arm = None if log_bayes is None else arm
     return CellFit(
-        views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, unknown, failure,
-        joints_note,
+        views, turned, observed, priors, found, log_bayes, arm, plain, smooth, pairs, certified, unknown,
+        failure, joints_note,
     )  # fmt: skip
 
 

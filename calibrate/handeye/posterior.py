@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import msgspec
 import numpy as np
 
 from calibrate.chain import Chain, LearnedChain, readings
 from calibrate.geometry import Array, difference
-from calibrate.handeye.arm import FLEX, flex_motion, gravity_in_flange, recorded_joints
+from calibrate.handeye.arm import (
+    FLEX,
+    flange_extent,
+    flex_motion,
+    gravity_in_flange,
+    recorded_joints,
+    smooth_motion,
+)
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import CellState, Layout
-from calibrate.handeye.estimate import CellFit
+from calibrate.handeye.estimate import CellFit, Estimate
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.pose_fit import central_pose
 from calibrate.handeye.priors import BoardTolerance, KnownBefore
@@ -26,33 +34,36 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     """Keep of a fit what later views need; None where no corners were recorded.
 
     stated_arm_error: (6, 6) covariance of X by it, zeros where none is stated.
-
-    Errors of an arm whose joints were not recorded stay inside the covariance of X: other postures have
-    others.
     """
     if not fit.observed.has_pixels:
         return None
-    found, state, at = fit.estimate, fit.estimate.state, Layout.of(fit.estimate.state)
-    chain = fit.arm.chain if fit.arm is not None and fit.arm.recorded else None
-    by_arm = 0 if fit.arm is None else len(fit.arm.chain.link_errors)
-    errors = np.arange(0 if chain is not None else by_arm, len(state.arm_errors))
-    kept = np.concatenate([at.all_but_board[: -len(state.arm_errors) or None], at.arm_errors.start + errors])
-    covariance = found.covariance[np.ix_(kept, kept)]
-    covariance[:6, :6] += fit.unknown_arm
-    scales = found.scales
+    smooth = None
+    if fit.smooth is not None:
+        extent = flange_extent(fit.views.base_from_flange)
+        smooth = msgspec.structs.replace(
+            _posterior(fit, fit.smooth, stated_arm_error), flange_extent_m=tuple(extent.tolist())
+        )
+        if fit.arm is None or not fit.arm.recorded:
+            return smooth
+    whole = _posterior(fit, fit.estimate, stated_arm_error)
+    arm = None if fit.arm is None else fit.arm.chain.plain
+    return msgspec.structs.replace(whole, arm=arm, without_joints=smooth)
+
+
+def _posterior(fit: CellFit, found: Estimate, stated_arm_error: Array) -> Posterior:
+    state, scales, kept = found.state, found.scales, Layout.of(found.state).all_but_board
     level = gravity_in_flange(fit.views.base_from_flange).mean(axis=0)
     return Posterior(
         X=_rows(state.X),
         lens=intrinsics_vector(state.camera).tolist(),
         shape=state.shape.tolist(),
-        errors=state.arm_errors[errors].tolist(),
-        covariance_lower=covariance[np.tril_indices(len(kept))].tolist(),
+        errors=state.arm_errors.tolist(),
+        covariance_lower=found.covariance[np.ix_(kept, kept)][np.tril_indices(len(kept))].tolist(),
         robot_noise=tuple(scales.robot.tolist()),
         corner_noise_px=(scales.tau_px, scales.lambda_px, scales.sigma_px),
         class_shares=scales.shares.tolist(),
         freedom=found.freedom,
         board_extent_m=_rows(fit.observed.extent),
-        arm=None if chain is None else chain.plain,
         stated_arm_error=_rows(stated_arm_error) if stated_arm_error.any() else None,
         level=tuple(level.tolist()) if len(state.arm_errors) else None,
     )
@@ -78,8 +89,10 @@ class KnownCell:
     gravity: Array | None
     stated_arm_error: Array = field(default_factory=lambda: np.zeros((6, 6)))
     """(6, 6) as `Posterior.stated_arm_error`."""
-    installed: tuple[Array, Array] | None = None
-    """The file's X (4, 4) for flanges as they are told, and its covariance (6, 6); None: `mean`'s."""
+    flange_extent: Array | None = None
+    """(4,) as `arm.flange_extent`, where the errors are the flange's; None: they are not."""
+    without_joints: KnownCell | None = None
+    """What is known before views whose joints are not; where there is a `chain`."""
 
     @property
     def knows_arm(self) -> bool:
@@ -116,6 +129,8 @@ class KnownCell:
             None if arm is None else Chain.of(arm),
             None if gravity is None else np.array(gravity),
             np.zeros((6, 6)) if posterior.stated_arm_error is None else np.array(posterior.stated_arm_error),
+            None if posterior.flange_extent_m is None else np.array(posterior.flange_extent_m),
+            None if posterior.without_joints is None else cls.of(posterior.without_joints, camera),
         )
 
     def with_board(self, tolerance: BoardTolerance) -> KnownCell:
@@ -124,7 +139,9 @@ class KnownCell:
         covariance = self.covariance.copy()
         covariance[shape], covariance[:, shape] = 0.0, 0.0
         covariance[shape, shape] = np.diag(tolerance.sigma**2)
-        return replace(self, mean=replace(self.mean, shape=np.zeros(len(SHAPE))), covariance=covariance)
+        mean, other = replace(self.mean, shape=np.zeros(len(SHAPE))), self.without_joints
+        other = None if other is None else other.with_board(tolerance)
+        return replace(self, mean=mean, covariance=covariance, without_joints=other)
 
     def prior(self, camera_may_have_moved: bool) -> KnownBefore:
         """Take this as what is known before new views; X not, where the camera may have moved since."""
@@ -135,19 +152,10 @@ class KnownCell:
         return KnownBefore(self.mean, information)
 
     def beside(self, views: ViewSet) -> KnownCell:
-        """Return what is known beside these views: not the arm's errors where their joints are not known.
-
-        X is then the one for flanges as the controller tells them.
-        """
-        if self.chain is None or self._joints(views) is not None:
+        """Return what is known before these views: not of the links where no joints are known."""
+        if self.without_joints is None or self._joints(views) is not None:
             return self
-        rest = slice(0, len(self.covariance) - len(self.mean.arm_errors))
-        mean, covariance = replace(self.mean, arm_errors=np.zeros(0)), self.covariance[rest, rest].copy()
-        if self.installed is not None:
-            mean = replace(mean, X=self.installed[0])
-            covariance[:6], covariance[:, :6] = 0.0, 0.0
-            covariance[:6, :6] = self.installed[1]
-        return replace(self, mean=mean, covariance=covariance, chain=None, gravity=None)
+        return self.without_joints
 
     def _joints(self, views: ViewSet) -> Array | None:
         """Read the joints (n, k) as the fit did: as its chain explains the flanges. None where none does."""
@@ -165,6 +173,8 @@ class KnownCell:
         columns, joints = np.zeros((len(views), 6, 0)), self._joints(views)
         if self.chain is not None and joints is not None:
             columns = self.chain.by_links(joints)
+        if self.flange_extent is not None:
+            columns = smooth_motion(views.base_from_flange, self.flange_extent)
         if self.gravity is not None:
             flex = flex_motion(views.base_from_flange, self.gravity)
             columns = np.concatenate([columns, flex], axis=2)

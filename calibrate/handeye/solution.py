@@ -56,8 +56,6 @@ class SolveOptions:
     lens_sigma: tuple[float, ...] | None = None
     """1σ of a given lens in the order of `projection.intrinsics_names`; None: the default 0.2 %."""
     board: BoardTolerance = field(default_factory=BoardTolerance)
-    model_arm: bool = True
-    """Allow for errors of the arm's kinematic table where its model is known."""
     working_distance_m: float | None = None
     """Distance along the camera's axis for the predicted error; None: median board distance."""
     holdout: bool = True

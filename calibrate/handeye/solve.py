@@ -90,7 +90,7 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     focal_sigma = float(min(priors.lens.sigma[0] / priors.lens.mean[0], _FREE_FOCAL))
     poses = pose_views(views, focal_sigma, priors.board.square)
     try:
-        fit = fit_cell(views, priors, options.seed, options.model_arm)
+        fit = fit_cell(views, priors, options.seed)
     except PosesDisagreeError as problem:
         session = explain_recording(poses, options.seed)
         raise PosesDisagreeError(

@@ -130,7 +130,7 @@ def test_a_wrong_pose_is_no_second_axis():
     H = perturb(cell.Y @ inverse(C) @ inverse(cell.X), rng.normal(size=(15, 6)) * 1e-4)
     H[4] = perturb(H[4], np.array([0.03, 0.0, 0.02, 0.1, 0.2, 0.1]))
     with pytest.raises((DegenerateMotionError, BadViewsError)) as refused:
-        solve_views(poses_only(H, C), SolveOptions(model_arm=False))
+        solve_views(poses_only(H, C), SolveOptions())
     assert refused.value.code in {"one-axis", "poses-disagree"}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -64,11 +63,6 @@ def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN
 def read_checks(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
     """Read the history of drift checks, oldest first; empty when there is none."""
     return read_lines(calibrations_folder(root, camera) / FILE, CheckEntry)
-
-
-def earlier_results(history: Sequence[CheckEntry], generation: int) -> list[bool]:
-    """List whether each check of this installed version passed, oldest first; one failure may be chance."""
-    return [entry.passed for entry in history if entry.generation == generation]
 
 
 def _duration(days: float) -> str:

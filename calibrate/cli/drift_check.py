@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from calibrate.check.drift import FEWEST_FOR_DRIFT_CHECK, POWER, DriftCheck, check_drift, known_cell
-from calibrate.check.history import Trend, append_check, earlier_results, read_checks
+from calibrate.check.history import Trend, append_check, read_checks
 from calibrate.check.production import MOST_PICTURES, check_production
 from calibrate.check.same_cell import CellIdentity, OtherCellError, require_same_cell
 from calibrate.check.trend import entry_of, find_trend
@@ -158,7 +158,7 @@ def _log(
     entry = entry_of(result, _taken(info).timestamp(), noted.version, info.name, board)
     trend = find_trend([*before, entry], noted.version, known_cell(calibration, board), board)
     append_check(msgspec.structs.replace(entry, trend=trend), noted.root, noted.camera)
-    return earlier_results(before, noted.version), trend
+    return [one.passed for one in before if one.generation == noted.version], trend
 
 
 def _taken(info: SessionInfo) -> datetime:

@@ -62,14 +62,9 @@ def mean_pose(poses: Array) -> Array:
     return pose(project_to_rotation(poses[:, :3, :3].mean(axis=0)), poses[:, :3, 3].mean(axis=0))
 
 
-def placed_boards(H: Array, camera_from_board: Array, X: Array) -> Array:
-    """Compute the board's pose by each view: H_i X C_i (n, 4, 4), all equal in a perfect world."""
-    return np.asarray(H @ X @ camera_from_board)
-
-
 def board_spread(H: Array, camera_from_board: Array, X: Array) -> tuple[float, float]:
-    """Compute the rms deviation of `placed_boards` from their mean: metres (board origin), radians."""
-    places = placed_boards(H, camera_from_board, X)
+    """Compute the rms deviation of H_i X C_i from their mean: metres (board origin), radians."""
+    places = H @ X @ camera_from_board
     mean = mean_pose(places)
     distance2 = ((places[:, :3, 3] - mean[:3, 3]) ** 2).sum(axis=1)
     angle = rotation_angle(mean[:3, :3].T @ places[:, :3, :3])

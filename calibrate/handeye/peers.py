@@ -35,7 +35,6 @@ from calibrate.handeye.metrics import (
     distance_in_sigmas,
     mean_pose,
     motion_errors,
-    placed_boards,
     require_solvable,
 )
 from calibrate.handeye.noise_scales import Scales
@@ -128,7 +127,7 @@ def _reprojection_only(views: ViewSet) -> Array:
     priors = Priors(lens, BoardTolerance(_EXACT, _EXACT))
     shares = np.array([1.0, *[1e-12] * 3])
     scales = Scales(np.array([_EXACT, _EXACT]), 1.0, 1.0, 1.0, shares)
-    Y = mean_pose(placed_boards(H, C, X))
+    Y = mean_pose(H @ X @ C)
     start = CellState(X, Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     return estimate(observed, start, priors, scales, fit="nothing").state.X
 
@@ -183,7 +182,7 @@ def reprojection_px(views: ViewSet, X: Array) -> float | None:
         return None
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     camera_from_place = inverse(H @ X)
-    Y = mean_pose(placed_boards(H, C, X))
+    Y = mean_pose(H @ X @ C)
     best = np.inf
     for _ in range(MAX_STEPS):
         C = camera_from_place @ Y

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import msgspec
 import numpy as np
 
 from calibrate.chain import Chain, LearnedChain, readings
@@ -19,7 +18,7 @@ from calibrate.handeye.arm import (
 )
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import CellState, Layout
-from calibrate.handeye.estimate import CellFit, Estimate
+from calibrate.handeye.estimate import CellFit
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.pose_fit import central_pose
 from calibrate.handeye.priors import BoardTolerance, KnownBefore
@@ -37,22 +36,11 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     """
     if not fit.observed.has_pixels:
         return None
-    smooth = None
-    if fit.smooth is not None:
-        extent = flange_extent(fit.views.base_from_flange)
-        smooth = msgspec.structs.replace(
-            _posterior(fit, fit.smooth, stated_arm_error), flange_extent_m=tuple(extent.tolist())
-        )
-        if fit.arm is None or not fit.arm.recorded:
-            return smooth
-    whole = _posterior(fit, fit.estimate, stated_arm_error)
-    arm = None if fit.arm is None else fit.arm.chain.plain
-    return msgspec.structs.replace(whole, arm=arm, without_joints=smooth)
-
-
-def _posterior(fit: CellFit, found: Estimate, stated_arm_error: Array) -> Posterior:
+    chain = fit.arm.chain if fit.arm is not None and fit.arm.recorded else None
+    found = fit.estimate if fit.smooth is None or chain is not None else fit.smooth
     state, scales, kept = found.state, found.scales, Layout.of(found.state).all_but_board
-    level = gravity_in_flange(fit.views.base_from_flange).mean(axis=0)
+    flanges = fit.views.base_from_flange
+    level, extent = gravity_in_flange(flanges).mean(axis=0), flange_extent(flanges)
     return Posterior(
         X=_rows(state.X),
         lens=intrinsics_vector(state.camera).tolist(),
@@ -64,8 +52,11 @@ def _posterior(fit: CellFit, found: Estimate, stated_arm_error: Array) -> Poster
         class_shares=scales.shares.tolist(),
         freedom=found.freedom,
         board_extent_m=_rows(fit.observed.extent),
+        arm=None if chain is None else chain.plain,
         stated_arm_error=_rows(stated_arm_error) if stated_arm_error.any() else None,
         level=tuple(level.tolist()) if len(state.arm_errors) else None,
+        flange_extent_m=tuple(extent.tolist()) if found is fit.smooth else None,
+        without_joints=None if chain is None else posterior_of(replace(fit, arm=None), stated_arm_error),
     )
 
 

@@ -14,7 +14,7 @@ from scipy import stats
 
 from calibrate.boards.model import board_points
 from calibrate.check.drift import POWER, DriftCheck, check_drift, find_shift, known_cell, powers
-from calibrate.check.history import CheckEntry, append_check, earlier_results, read_checks
+from calibrate.check.history import CheckEntry, append_check, read_checks
 from calibrate.check.trend import entry_of, find_trend
 from calibrate.cli.drift_check import check_text
 from calibrate.errors import BadViewsError, TooFewViewsError
@@ -289,9 +289,6 @@ def test_a_trend_is_found_before_a_check_fails(tmp_path: Path) -> None:
     assert find_trend(read_checks(tmp_path), 2, KNOWN) is None
     steady = [entry(day, 0.1) for day in range(8)]
     assert find_trend(steady, 1, KNOWN) is None and find_trend(steady[:3], 1, KNOWN) is None
-    failed = msgspec.structs.replace(steady[0], passed=False)
-    assert earlier_results([*steady[:3], failed], 1) == [True, True, True, False]
-    assert earlier_results(steady, 2) == []
 
 
 @pytest.mark.parametrize("freedom", [9.0, 69.0])

@@ -74,7 +74,7 @@ class EarlierPictures:
         observed = self.known.observe(newest)
         C = newest.camera_from_board
         C = fit_corners(observed, self.state.camera, C, shape=self.state.shape, robust=True).C
-        linear = Linear.at(observed, self.state.with_boards(C), observed.present)
+        linear = Linear.at(observed, replace(self.state, C=C), observed.present)
         tests = [self._shift(linear, count) for count in NEWEST if count <= len(newest)]
         return min(tests, key=lambda test: test.p_value)
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import special
 
 from calibrate.geometry import Array, difference
+from calibrate.handeye.arm import FLEX
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import Estimate, MeanParts, corner_weights, is_settled
 from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
@@ -43,12 +44,12 @@ Sizes = tuple[int, int, int]
 class _Sizes:
     """All combinations of sizes, and the prior of the errors for each."""
 
-    def __init__(self, links: int, bends: int) -> None:
-        """Take the numbers of the links' errors (each has 3 shifts, then 3 turns) and of the bracket's."""
-        self.kinds = np.repeat([*np.tile([0, 1], links // 6), 2], [*np.full(links // 3, 3), bends])
+    def __init__(self, by_arm: int) -> None:
+        """Take the number of the arm's errors: 3 shifts, then 3 turns, and so on; a bracket's follow."""
+        self.kinds = np.repeat([*np.tile([0, 1], by_arm // 6), 2], [*np.full(by_arm // 3, 3), len(FLEX)])
         """(q,) size that an error goes by, as a place in `Sizes`: 0 shift, 1 turn, 2 bend."""
-        size = len(SIZES) if links else 1
-        self.shape = (size, size, len(BENDS) if bends else 1)
+        size = len(SIZES) if by_arm else 1
+        self.shape = (size, size, len(BENDS))
 
     def sigma(self, one: Sizes) -> Array:
         """1σ (q,) of each error, mm and mrad."""
@@ -69,17 +70,16 @@ class _Sizes:
 
 
 def estimate_with_arm_errors(
-    observed: Observations, plain: Estimate, priors: Priors, link_errors: int
+    observed: Observations, plain: Estimate, priors: Priors
 ) -> tuple[Estimate, float]:
     """Estimate again with systematic errors of arm and bracket, starting from the estimate without them.
 
-    The first `link_errors` errors are those of the arm's links, the others a bracket's. The second value is
-    the log evidence of errors of any size against none; above 3 they are worth saying. Raises LinAlgError
-    where it fails.
+    The last errors of `observed` are a bracket's (`FLEX`), those before them the arm's: of its links or,
+    where they are unknown, of its flange. The second value is the log evidence of errors of any size against none;
+    above 3 they are worth saying. Raises LinAlgError where it fails.
     """
-    columns = observed.by_arm_errors.shape[2]
-    sizes = _Sizes(link_errors, columns - link_errors)
-    state = replace(plain.state, arm_errors=np.zeros(columns))
+    state = replace(plain.state, arm_errors=np.zeros(observed.by_arm_errors.shape[2]))
+    sizes = _Sizes(len(state.arm_errors) - len(FLEX))
     weights, log_bayes, kept = plain.corner_weights, 0.0, dict[Sizes, LinearSolution]()
     converged, steps = False, 0
     while steps < MAX_STEPS and not converged:
@@ -106,7 +106,6 @@ def estimate_with_arm_errors(
         best = solutions[int(chances.argmax())]
         weights = corner_weights(observed, state, best.scales.sigma_px)
         converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
-    of_X = covariance[:6, :6]
     classes = np.einsum("s,snk->nk", chances, [s.chances for s in solutions])
     with_errors = replace(
         plain,
@@ -125,7 +124,9 @@ def estimate_with_arm_errors(
         steps=steps,
         converged=converged,
         # Variances of X in each part over that of the mixture, averaged over directions.
-        mean_of=MeanParts(chances, np.einsum("ij,sji->s", inverse_of(of_X) / 6, spread[:, :6, :6])),
+        mean_of=MeanParts(
+            chances, np.einsum("ij,sji->s", inverse_of(covariance[:6, :6]) / 6, spread[:, :6, :6])
+        ),
     )
     return with_errors, log_bayes
 

@@ -34,10 +34,6 @@ class CellState:
     arm_errors: Array
     """(q,) errors of the arm's links and of a bracket that bends (`handeye.arm`); empty: not modelled."""
 
-    def with_boards(self, C: Array) -> CellState:
-        """Return a copy with the board poses (m, 4, 4) in place of its own."""
-        return replace(self, C=C)
-
     def moved(self, step: Array, by_view: Array) -> CellState:
         """Return the state after a step: (G,) for the shared unknowns, in `Layout`'s order, (n, 6) for C."""
         at = Layout.of(self)

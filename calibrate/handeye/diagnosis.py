@@ -196,9 +196,9 @@ def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
     """Compute residuals (m, 6) of the views left out, and their covariance (m, 6, 6) by the other views."""
     others = np.setdiff1d(np.arange(len(fit.views)), left_out)
     whole = fit.estimate
-    start = whole.state.with_boards(whole.state.C[others])
+    start = replace(whole.state, C=whole.state.C[others])
     found = estimate(fit.observed.part(others), start, fit.priors, whole.scales)
-    seen = found.state.with_boards(whole.board_poses[left_out])
+    seen = replace(found.state, C=whole.board_poses[left_out])
     linear = Linear.at(fit.observed.part(left_out), seen, whole.corner_weights[left_out])
     return linear.m, linear.predicted(found.scales, found.covariance)
 

@@ -59,15 +59,17 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
         flex = flex_motion(views.base_from_flange)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
         STAGES.info("3 of 4: errors of the arm")
-        modelled = replace(observed, by_arm_errors=np.concatenate([links, flex], axis=2))
+        smoothly = smooth_motion(observed.flange, flange_extent(observed.flange))
+        linked, smoothed = (
+            replace(observed, by_arm_errors=np.concatenate([by_arm, flex], axis=2))
+            for by_arm in (links, smoothly)
+        )
         try:
-            allowed, evidence = estimate_with_arm_errors(modelled, found, priors, links.shape[2])
-            columns = smooth_motion(observed.flange, flange_extent(observed.flange))
-            both = replace(observed, by_arm_errors=np.concatenate([columns, flex], axis=2))
-            as_told, _ = estimate_with_arm_errors(both, plain, priors, columns.shape[2])
+            allowed, evidence = estimate_with_arm_errors(linked, plain, priors)
+            as_told, _ = estimate_with_arm_errors(smoothed, plain, priors)
             if arm is None:
                 unknown = unknown_arm_covariance(allowed, as_told)
-            found, log_bayes, observed, smooth = allowed, evidence, modelled, as_told
+            found, log_bayes, observed, smooth = allowed, evidence, linked, as_told
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used))

@@ -99,10 +99,9 @@ class Priors:
         at = Layout.of(state)
         N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
         vector = intrinsics_vector(state.camera)
-        errors = state.arm_errors
-        errors_sigma = np.broadcast_to(ARM_ERROR_UNIT * np.asarray(arm_error_sigma), errors.shape)
+        errors_sigma = np.broadcast_to(ARM_ERROR_UNIT * np.asarray(arm_error_sigma), state.arm_errors.shape)
         sigma = np.concatenate([self.lens.sigma, self.board.sigma, errors_sigma])
-        value = np.concatenate([vector - self.lens.mean, state.shape, errors])
+        value = np.concatenate([vector - self.lens.mean, state.shape, state.arm_errors])
         places = np.arange(at.lens.start, at.arm_errors.stop)
         N[places, places] = sigma**-2.0
         right[places] = -value / sigma**2

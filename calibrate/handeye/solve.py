@@ -249,7 +249,7 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
         return None
     whole = fit.estimate
     try:
-        start = whole.state.with_boards(whole.state.C[first])
+        start = replace(whole.state, C=whole.state.C[first])
         partial = estimate(fit.observed.part(first), start, fit.priors, whole.scales)
     except BadViewsError:
         return None

@@ -201,8 +201,6 @@ class Posterior(msgspec.Struct, frozen=True, omit_defaults=True):
     """Covariance (6, 6) of X by the stated error of the robot: one in the fit, another in every check."""
     level: tuple[float, ...] | None = None
     """Mean direction of gravity in the flange, to which X belongs; None: no bracket's bend in `errors`."""
-    gravity: tuple[float, ...] | None = None
-    """`level` in earlier files, where the bracket's `errors` have the other sign."""
     flange_extent_m: tuple[float, ...] | None = None
     """Mean place of the flange and its rms distance from there, by which a flange's smooth errors go."""
     without_joints: Posterior | None = None

@@ -9,7 +9,7 @@ estimate. Errors of lens and arm are the same in fit and check, so they are not 
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -85,16 +85,15 @@ class DriftCheck:
 def known_cell(calibration: Calibration, board: BoardSpec | None = None) -> KnownCell:
     """Return what a calibration leaves known before views of `board` (None: of its own).
 
-    A file of the first version states X, its noise, lens and board each by itself, and nothing of the arm.
-    Raises BadViewsError for one that states no noise.
+    A file of the first version states X, its noise, lens and board each by itself, and nothing of the arm; so
+    is an earlier one read that has errors of the arm for views with joints alone. Raises BadViewsError for
+    one that states no noise.
     """
-    camera = calibration.intrinsics.model
-    if calibration.posterior is None:
+    kept = calibration.posterior
+    if kept is None or (kept.errors and kept.flange_extent_m is None and kept.without_joints is None):
         known = stated_cell(calibration)
     else:
-        known = KnownCell.of(calibration.posterior, camera)
-        if known.chain is not None and known.without_joints is None:  # an earlier file
-            known = replace(known, without_joints=stated_cell(calibration))
+        known = KnownCell.of(kept, calibration.intrinsics.model)
     if board is None or board == calibration.board:
         return known
     return known.with_board(BoardTolerance.of(board))

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from scipy import special
 
-from calibrate.geometry import Array, difference
+from calibrate.geometry import Array
 from calibrate.handeye.arm import FLEX
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import Estimate, MeanParts, corner_weights, is_settled
@@ -75,8 +75,8 @@ def estimate_with_arm_errors(
     """Estimate again with systematic errors of arm and bracket, starting from the estimate without them.
 
     The last errors of `observed` are a bracket's (`FLEX`), those before them the arm's: of its links or,
-    where they are unknown, of its flange. The second value is the log evidence of errors of any size against none;
-    above 3 they are worth saying. Raises LinAlgError where it fails.
+    where they are unknown, of its flange. The second value is the log evidence of errors of any size against
+    none; above 3 they are worth saying. Raises LinAlgError where it fails.
     """
     state = replace(plain.state, arm_errors=np.zeros(observed.by_arm_errors.shape[2]))
     sizes = _Sizes(len(state.arm_errors) - len(FLEX))
@@ -107,6 +107,7 @@ def estimate_with_arm_errors(
         weights = corner_weights(observed, state, best.scales.sigma_px)
         converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
     classes = np.einsum("s,snk->nk", chances, [s.chances for s in solutions])
+    of_X = covariance[:6, :6]
     with_errors = replace(
         plain,
         state=state,
@@ -124,22 +125,9 @@ def estimate_with_arm_errors(
         steps=steps,
         converged=converged,
         # Variances of X in each part over that of the mixture, averaged over directions.
-        mean_of=MeanParts(
-            chances, np.einsum("ij,sji->s", inverse_of(covariance[:6, :6]) / 6, spread[:, :6, :6])
-        ),
+        mean_of=MeanParts(chances, np.einsum("ij,sji->s", inverse_of(of_X) / 6, spread[:, :6, :6])),
     )
     return with_errors, log_bayes
-
-
-def unknown_arm_covariance(found: Estimate, smooth: Estimate) -> Array:
-    """Compute what smooth errors of the flange add to the covariance (6, 6) of X.
-
-    X stays where it fits the flanges as they are told. Its distance from the mean with errors is error.
-    """
-    off = difference(smooth.state.X, found.state.X)
-    added = smooth.covariance[:6, :6] + np.outer(off, off) - found.covariance[:6, :6]
-    values, vectors = np.linalg.eigh((added + added.T) / 2)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _solve(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array
+from calibrate.geometry import Array, difference
 from calibrate.handeye.arm import ArmPostures
 from calibrate.handeye.axxb.global_start import GlobalResult
 from calibrate.handeye.axxb.pairs import Pairs
@@ -180,9 +180,22 @@ class CellFit:
     """Pairs of the views that count."""
     certified: GlobalResult
     """Optimum of the quadratic objective over these pairs."""
-    unknown_arm: Array
-    """(6, 6) what errors of an arm of unknown kinematics add to the covariance of X."""
     arm_failure: str = ""
     """Why systematic errors could not be fitted, where that failed."""
     joints_note: str = ""
     """What is unusual about the recorded joints."""
+
+    @property
+    def unknown_arm(self) -> Array:
+        """Compute what errors of an arm of unknown kinematics add to the covariance (6, 6) of X.
+
+        X stays where it fits the flanges as they are told. Its distance from the mean with smooth errors is
+        error.
+        """
+        if self.arm is not None or self.smooth is None:
+            return np.zeros((6, 6))
+        found, smooth = self.estimate, self.smooth
+        off = difference(smooth.state.X, found.state.X)
+        added = smooth.covariance[:6, :6] + np.outer(off, off) - found.covariance[:6, :6]
+        values, vectors = np.linalg.eigh((added + added.T) / 2)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

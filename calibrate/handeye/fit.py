@@ -10,7 +10,7 @@ import numpy as np
 from calibrate.errors import PosesDisagreeError
 from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import arm_postures, flange_extent, flex_motion, smooth_motion
-from calibrate.handeye.arm_fit import estimate_with_arm_errors, unknown_arm_covariance
+from calibrate.handeye.arm_fit import estimate_with_arm_errors
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.cell_state import CellState
@@ -53,7 +53,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
     STAGES.info("2 of 4: camera, board and lens together")
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
-    log_bayes, plain, failure, unknown, smooth = None, found, "", np.zeros((6, 6)), None
+    log_bayes, plain, failure, smooth = None, found, "", None
     arm, joints_note = arm_postures(views)
     if len(views) >= FEWEST_FOR_ARM_ERRORS:
         flex = flex_motion(views.base_from_flange)
@@ -67,8 +67,6 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
         try:
             allowed, evidence = estimate_with_arm_errors(linked, plain, priors)
             as_told, _ = estimate_with_arm_errors(smoothed, plain, priors)
-            if arm is None:
-                unknown = unknown_arm_covariance(allowed, as_told)
             found, log_bayes, observed, smooth = allowed, evidence, linked, as_told
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
@@ -76,8 +74,8 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
     require_motion(pairs)  # a wrong view may have been the only one about a second axis
     arm = None if log_bayes is None else arm
     return CellFit(
-        views, turned, observed, priors, found, log_bayes, arm, plain, smooth, pairs, certified, unknown,
-        failure, joints_note,
+        views, turned, observed, priors, found, log_bayes, arm, plain, smooth, pairs, certified, failure,
+        joints_note,
     )  # fmt: skip
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from calibrate.chain import Chain, LearnedChain, readings
 from calibrate.geometry import Array, difference
 from calibrate.handeye.arm import (
-    FLEX,
     flange_extent,
     flex_motion,
     gravity_in_flange,
@@ -77,7 +76,7 @@ class KnownCell:
     extent: Array
     """(2, 2) as `Observations.extent`."""
     chain: Chain | None
-    gravity: Array | None
+    level: Array | None
     stated_arm_error: Array = field(default_factory=lambda: np.zeros((6, 6)))
     """(6, 6) as `Posterior.stated_arm_error`."""
     flange_extent: Array | None = None
@@ -98,11 +97,6 @@ class KnownCell:
         covariance = np.zeros((size, size))
         covariance[np.tril_indices(size)] = posterior.covariance_lower
         covariance += np.tril(covariance, -1).T
-        if posterior.gravity is not None:
-            errors[-len(FLEX) :] *= -1
-            covariance[-len(FLEX) :] *= -1
-            covariance[:, -len(FLEX) :] *= -1
-        arm, gravity = posterior.arm, posterior.level or posterior.gravity
         tau, lambda_, sigma = posterior.corner_noise_px
         return cls(
             CellState(
@@ -117,8 +111,8 @@ class KnownCell:
             Scales(np.array(posterior.robot_noise), tau, lambda_, sigma, np.array(posterior.class_shares)),
             posterior.freedom,
             np.array(posterior.board_extent_m),
-            None if arm is None else Chain.of(arm),
-            None if gravity is None else np.array(gravity),
+            None if posterior.arm is None else Chain.of(posterior.arm),
+            None if posterior.level is None else np.array(posterior.level),
             np.zeros((6, 6)) if posterior.stated_arm_error is None else np.array(posterior.stated_arm_error),
             None if posterior.flange_extent_m is None else np.array(posterior.flange_extent_m),
             None if posterior.without_joints is None else cls.of(posterior.without_joints, camera),
@@ -166,8 +160,8 @@ class KnownCell:
             columns = self.chain.by_links(joints)
         if self.flange_extent is not None:
             columns = smooth_motion(views.base_from_flange, self.flange_extent)
-        if self.gravity is not None:
-            flex = flex_motion(views.base_from_flange, self.gravity)
+        if self.level is not None:
+            flex = flex_motion(views.base_from_flange, self.level)
             columns = np.concatenate([columns, flex], axis=2)
         return replace(observed, by_arm_errors=columns)
 

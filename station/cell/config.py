@@ -19,6 +19,9 @@ Place = tuple[_Metres, _Metres, _Metres]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Length = Annotated[float, msgspec.Meta(gt=0, le=LARGEST_REACH_M)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+_Angle = Annotated[float, msgspec.Meta(ge=-6.3, le=6.3)]
+"""Joint angle: none turns further than once around; a larger one was written in degrees."""
+JointAngles = tuple[_Angle, _Angle, _Angle, _Angle, _Angle, _Angle]
 
 
 def vector3(values: Iterable[float]) -> Vector3:
@@ -133,7 +136,7 @@ class Plane(Section, frozen=True):
     """Table, wall or ceiling in `base`; the arm stays on the side that the normal points to."""
 
     name: str
-    point_m: Vector3
+    point_m: Place
     normal: Vector3
 
 
@@ -149,20 +152,21 @@ are writing errors, and the driver could not tell the arm from one that does not
 class LimitsConfig(Section, frozen=True):
     speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=SPEED_CAP_M_S)] = 0.25
     """Largest speed of any modelled point of arm, tool or camera; at most 0.25."""
-    joint_speed_rad_s: Positive = 0.6
+    joint_speed_rad_s: Annotated[float, msgspec.Meta(gt=0, le=3.2)] = 0.6
+    """At most 3.2, the fastest of a UR; more was written in degrees."""
     joint_acceleration_rad_s2: Positive = 1.0
-    joint_step_rad: Positive = 3.2
+    joint_step_rad: Annotated[float, msgspec.Meta(gt=0, le=12.6)] = 3.2
     """Largest turn of one joint between neighbouring poses."""
-    joints_min_rad: Vector6 | None = None
-    joints_max_rad: Vector6 | None = None
-    workspace_min_m: Vector3 | None = None
-    workspace_max_m: Vector3 | None = None
+    joints_min_rad: JointAngles | None = None
+    joints_max_rad: JointAngles | None = None
+    workspace_min_m: Place | None = None
+    workspace_max_m: Place | None = None
     """Corner of the box in `base` in which flange and camera must stay; None: no box."""
     planes: tuple[Plane, ...] = ()
     solids: tuple[Capsule, ...] = ()
     """Solids on the flange, in `flange`."""
-    clearance_m: Positive = 0.03
-    board_clearance_m: Positive = 0.10
+    clearance_m: Length = 0.03
+    board_clearance_m: Length = 0.10
 
 
 class PointerConfig(Section, frozen=True):

@@ -63,6 +63,12 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
             "joints_min_rad: [1, 0, 0, 0, 0, 0]\n  joints_max_rad: [0, 1, 1, 1, 1, 1]",
             "must not be above",
         ),
+        ("point_m: [0, 0, 0]", "point_m: [0, 0, -20]", "limits.planes[0].point_m[2]: Expected"),
+        ("speed_m_s: 0.2", "workspace_min_m: [-900, -900, 0]", "limits.workspace_min_m[1]: Expected"),
+        ("speed_m_s: 0.2", "joints_max_rad: [90, 90, 90, 90, 90, 90]", "limits.joints_max_rad[5]: Expected"),
+        ("speed_m_s: 0.2", "joint_step_rad: 180", "limits.joint_step_rad: Expected `float` <= 12.6"),
+        ("speed_m_s: 0.2", "joint_speed_rad_s: 15", "limits.joint_speed_rad_s: Expected `float` <= 3.2"),
+        ("speed_m_s: 0.2", "clearance_m: 30", "limits.clearance_m: Expected `float` <= 5"),
         (
             "speed_m_s: 0.2",
             "workspace_min_m: [-1, -1, 0.5]\n  workspace_max_m: [1, 1, 0.5]",

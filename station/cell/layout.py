@@ -18,7 +18,7 @@ from calibrate.geometry import (
     rotation_log,
     transform_points,
 )
-from calibrate.kinematics import MODELS, RobotModel, forward
+from calibrate.kinematics import MODELS, RobotModel, forward, with_near_axes
 from calibrate.projection import camera_matrix
 from calibrate.views import board_in_camera, implied_flange
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
@@ -157,7 +157,8 @@ def cell_geometry(config: StationConfig) -> CellGeometry:
     """Make the geometry for checks before motion: solids and obstacles by the initial poses where given.
 
     A camera or board on the flange gets thicker by three sigmas, at most 30 mm; the clearance of one that is
-    fixed in the cell grows by two. Configured solids on the flange are taken as exact.
+    fixed in the cell grows by two. Configured solids on the flange are taken as exact. The axes of a factory
+    calibration are restated: its frames may lie metres away from the arm.
     """
     camera, board, limits = config.camera_guess, config.board_guess, config.limits
     in_hand = config.mount == "eye-in-hand"
@@ -182,7 +183,8 @@ def cell_geometry(config: StationConfig) -> CellGeometry:
             thicker_m = _thicker_m(board.sigma_m)
             solids += tuple(msgspec.structs.replace(rod, radius_m=rod.radius_m + thicker_m) for rod in rods)
             watched = tuple(vector3(p) for p in transform_points(Y, printed_corners(config.board)))
-    return CellGeometry(arm_model(config.robot), limits, solids, obstacles, clearance, watched, config.mount)
+    model = with_near_axes(arm_model(config.robot))
+    return CellGeometry(model, limits, solids, obstacles, clearance, watched, config.mount)
 
 
 def camera_body(parent_from_camera: Array, radius_m: float) -> Capsule:
@@ -196,13 +198,21 @@ def _thicker_m(sigma_m: float) -> float:
 
 
 def require_kept_clear(config: StationConfig) -> None:
-    """Raise LimitError when a camera or board pose is too uncertain for the collision checks."""
-    name = "camera_guess" if config.mount == "eye-in-hand" else "board_guess"
-    guess: PoseGuess | None = getattr(config, name)
-    drawn = config.mount == "eye-in-hand" and config.limits.solids
-    if guess is None or drawn or guess.sigma_m <= _MOST_DOUBT_M:
-        return
-    raise LimitError("guess-too-rough", guess=name, sigma_m=guess.sigma_m, limit_m=_MOST_DOUBT_M)
+    """Raise unless camera and board can be kept clear of what they would hit.
+
+    ConfigError: it is not known where one of them is, unless it is drawn in `limits.solids`. LimitError: the
+    pose of the one on the flange is too uncertain for the collision checks.
+    """
+    in_hand = config.mount == "eye-in-hand"
+    drawn = in_hand and config.limits.solids
+    for name, on_flange in (("camera_guess", in_hand), ("board_guess", not in_hand)):
+        guess: PoseGuess | None = getattr(config, name)
+        if on_flange and drawn:
+            continue
+        if guess is None:
+            raise ConfigError("no-guess", missing=name)
+        if on_flange and guess.sigma_m > _MOST_DOUBT_M:
+            raise LimitError("guess-too-rough", guess=name, sigma_m=guess.sigma_m, limit_m=_MOST_DOUBT_M)
 
 
 def pose_vector(matrix: Array) -> Vector6:

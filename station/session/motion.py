@@ -20,7 +20,7 @@ from station.analysis.worker import check_run
 from station.cell.arm_acceptance import StopTestMove
 from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError
-from station.cell.layout import arm_model
+from station.cell.layout import arm_model, require_kept_clear
 from station.cell.limits import PlanCheck
 from station.cell.pose_plan import Plan
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
@@ -71,7 +71,11 @@ def session_motion(context: SessionContext, purpose: Purpose) -> Motion:
 
 
 async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
-    """Check the whole path in the worker and make the preview. LimitError: not free; RobotError."""
+    """Check the whole path in the worker and make the preview.
+
+    LimitError: not free; ConfigError: nobody knows where camera or board are; RobotError.
+    """
+    require_kept_clear(context.cell.config)
     try:
         await DISK.run(require_free_space, context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:

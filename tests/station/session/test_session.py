@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock
@@ -17,11 +18,12 @@ from calibrate.recorded_views import load_views
 from recordings.manifest import enter_part
 from recordings.reader import open_recording
 from recordings.schema.messages import ArmKinematics
+from station.cell.arm_acceptance import StopWay
 from station.cell.clock_fit import ClockFit
 from station.cell.errors import LimitError, RobotError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.verbs import Purpose
+from station.protocol.verbs import Purpose, StopTest
 from tests.codes import raises
 from tests.durability import disk_order
 from tests.patience import PATIENCE_S, until
@@ -203,6 +205,19 @@ async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_pl
     with raises("plan", LimitError):
         await rig.session.prepare(1, Purpose.RUN)
     assert "move" not in rig.arm.log
+
+
+@pytest.mark.parametrize("purpose", [Purpose.RUN, Purpose.STOP_TEST])
+async def test_no_motion_is_offered_while_nobody_knows_where_the_camera_is(
+    rig: Rig, purpose: Purpose
+) -> None:
+    context = rig.session.context
+    config = msgspec.structs.replace(context.cell.config, camera_guess=None)
+    context.cell = replace(context.cell, config=config)
+    test = StopTest(StopWay.CONTROL, 0.05) if purpose is Purpose.STOP_TEST else None
+    with raises("no-guess"):
+        await rig.session.prepare(1, purpose, test)
+    assert rig.session.store.status.go is None
 
 
 async def test_nobody_approves_what_the_arm_will_refuse(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -117,6 +117,8 @@ def moving_points(geometry: CellGeometry, joints_rad: Array) -> Array:
     return np.concatenate(points, axis=1)
 
 
+_LEVEL = 0.99
+"""Cosine between a plane's normal and base's z axis from which it is a table or ceiling: to 8°."""
 _TINY = 1e-24
 """Squared length below which a segment is a point."""
 
@@ -178,8 +180,8 @@ def margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, tuple[Con
     for plane in limits.planes:
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
         height = np.minimum((starts - plane.point_m) @ normal, (ends - plane.point_m) @ normal)
-        # The upper arm's near end is the shoulder, which does not move.
-        height[:, 2] = (ends[:, 2] - plane.point_m) @ normal
+        if abs(normal[2]) > _LEVEL:  # the upper arm's near end, the shoulder, turns level about the base
+            height[:, 2] = (ends[:, 2] - plane.point_m) @ normal
         columns.append(height[:, movers] - radii[movers] - limits.clearance_m)
         contacts += [Contact(body, plane.name, "plane") for body in names[movers]]
     if limits.workspace_min_m is not None or limits.workspace_max_m is not None:

@@ -43,6 +43,28 @@ def test_an_arm_at_ease_touches_nothing_of_itself(name):
     assert gaps.min() > 0, contacts[gaps[0].argmin()]
 
 
+@pytest.mark.parametrize(
+    ("plane", "met"),
+    [
+        (Plane("wall", (0.25, 0.0, 0.0), (-1.0, 0.0, 0.0)), True),
+        (Plane("sloping wall", (0.2, 0.0, 0.0), (-1.0, 0.0, 0.6)), True),
+        (Plane("table", (0.0, 0.0, 0.1), (0.05, 0.0, 1.0)), False),
+    ],
+)
+def test_the_shoulder_meets_a_wall_but_no_table_that_it_stands_above(plane, met):
+    """It turns about the base, level: it is near a wall at some angles only, near a table at all."""
+    geometry = CellGeometry(MODELS["UR10"], LimitsConfig(planes=(plane,)))
+    turns = UPRIGHT + np.linspace(0, 2 * np.pi, 60)[:, None] * [1, 0, 0, 0, 0, 0]
+    turns[:, 1] = np.deg2rad(-150)  # the upper arm leans away from where the shoulder is
+    starts, _, radii = body_segments(geometry, turns)
+    normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
+    shoulder = (starts[:, 2] - plane.point_m) @ normal - radii[2] - geometry.limits.clearance_m
+    gaps, contacts = margins(geometry, turns)
+    upper = gaps[:, contacts.index(("upper arm", plane.name, "plane"))]
+    assert shoulder.min() < 0
+    assert ((upper <= shoulder + 1e-9) | (shoulder > 0)).all() == met
+
+
 def test_a_folded_wrist_runs_into_the_forearm():
     camera = Capsule("camera", (0.0, 0.0, 0.1), (0.0, 0.0, 0.18), 0.04)
     geometry = CellGeometry(MODELS["UR10"], LimitsConfig(), solids=(camera,))

@@ -28,6 +28,8 @@ class Daemon:
     def __init__(self, ungiven: int) -> None:
         self.asked: list[StopTest] = []
         self.went, self.ungiven = 0, ungiven
+        self.fastest_m_s = 1.0
+        """No move goes faster."""
 
     async def call(self, verb: Verb[Any], *, timeout_s: float = 30.0) -> Any:
         if isinstance(verb, Go):
@@ -37,7 +39,7 @@ class Daemon:
         test = verb.stop_test
         self.asked.append(test)
         move = StopTestMove(test.way, SUBJECT, 0, 0.1, 0.1)
-        figures = 0.1, 0.1, test.speed_m_s, 3.0
+        figures = 0.1, 0.1, min(0.97 * test.speed_m_s, self.fastest_m_s), 3.0
         return MotionPreview(str(len(self.asked)), "", "", 1, *figures, "", stop_test=move)
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
@@ -102,6 +104,14 @@ async def test_every_way_has_its_own_approval_and_it_is_accepted_up_to_the_chose
     assert found.accepted and found.speed_m_s == 0.1
     assert [(verb.way, verb.speed_m_s) for verb in daemon.asked] == [(way, 0.1) for way in StopWay]
     assert len({preview.token for preview in hands.approved}) == daemon.went == len(StopWay)
+
+
+async def test_it_is_accepted_up_to_the_speed_that_was_reached() -> None:
+    """A wrist at its largest joint speed is slow: nobody saw how the arm stops at what was wanted."""
+    daemon, _, test = begun()
+    daemon.fastest_m_s = 0.06
+    found = await test.run()
+    assert found.accepted and found.speed_m_s == 0.06
 
 
 async def test_part_of_the_ways_accepts_nothing() -> None:

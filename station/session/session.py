@@ -71,6 +71,8 @@ class Session:
         self.freedrive = FreedriveCapture(self.context, self.previews)
         self._estimator = Estimator(self.context)
         self._run: asyncio.Task[None] | None = None
+        self._stops = 0
+        """Number of STOPs: an acknowledgement is not of one that came after it was asked for."""
         self._tasks: list[asyncio.Task[None]] = []
         cell.arm.subscribe(monitor.add)
         cell.arm.subscribe(self.context.record_state)
@@ -114,6 +116,7 @@ class Session:
 
     async def stop(self, who: str) -> None:
         """Stop the arm now, from any client, in any state; latched until acknowledged."""
+        self._stops += 1
         if self.store.state is StationState.STOPPED:
             await self.context.cell.stop(f"STOP by {who}")
             return
@@ -148,12 +151,15 @@ class Session:
     async def acknowledge(self, who: str) -> None:
         """Leave `stopped` or `fault` after a person looked at the cell."""
         self._require_state(verbs.Acknowledge)
+        stops = self._stops
         try:
             await fresh(self.context.cell.arm)
             resting = self.context.resting
         except RobotError:
             resting = StationState.DISCONNECTED
         self._require_state(verbs.Acknowledge)
+        if self._stops != stops:
+            raise RefusedError("stopped-again")
         self.store.enter(resting)
         self.store.event("acknowledged", f"acknowledged by {who}", who=who)
 

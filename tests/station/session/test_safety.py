@@ -51,6 +51,22 @@ async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: 
     assert rig.state is S.STOPPED and "stop" in rig.arm.log
 
 
+@pytest.mark.parametrize("state", [S.STOPPED, S.FAULT])
+async def test_a_stop_behind_an_acknowledgement_stays_latched(rig: Rig, state: S) -> None:
+    """The acknowledgement waits for late news; who presses STOP meanwhile has seen something new."""
+    rig.session.store.enter(state)
+    rig.arm.late = True
+    acknowledging = asyncio.ensure_future(rig.session.acknowledge("anna"))
+    await asyncio.sleep(0)
+    await rig.session.stop("bert")
+    rig.arm.late = False
+    with raises("stopped-again"):
+        await acknowledging
+    assert rig.state is S.STOPPED
+    await rig.session.acknowledge("anna")
+    assert rig.state is S.IDLE
+
+
 @pytest.mark.parametrize("offered", [False, True], ids=["while the path is checked", "after the offer"])
 @pytest.mark.parametrize("change", ["stop", "edit", "release", "prepare"])
 async def test_what_changes_leaves_no_approval(rig: Rig, change: str, offered: bool) -> None:

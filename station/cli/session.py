@@ -98,11 +98,13 @@ class Attended:
 async def attended(
     socket: Path | None, headless: bool = False, approved: str = "", quiet: bool = False, camera: bool = True
 ) -> AsyncIterator[Attended]:
-    """A connection to the cell that serves `socket`, its devices connected. Ctrl-C stops what was approved.
+    """A connection to the cell that serves `socket`, its devices connected. Ctrl-C and Ctrl-Z stop the arm.
 
     `camera`: it is needed, too.
     """
     path = socket or default_socket()
+    # Ctrl-Z would leave the arm moving, and this command unable to hear Ctrl-C: it means the same.
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTSTP, signal.raise_signal, signal.SIGINT)
     async with Client(path) as client:
         simulated = (await wait_until_idle(client, camera=camera)).simulated
         shell = Attended(path, client, simulated, headless, approved, quiet)

@@ -56,7 +56,7 @@ def _value_problems(plan: Plan) -> list[str]:
         where = f"poses[{number}] ({pose.name})"
         if names.index(pose.name) != number:
             problems.append(f"{where}: the name is used twice")
-        if np.abs(pose.joints_rad).max() > 2 * np.pi + 1e-9:
+        if not np.abs(pose.joints_rad).max(initial=0.0) <= 2 * np.pi + 1e-9:
             problems.append(f"{where}: a joint is beyond ±360°; joints are in radians, not degrees")
         matrix = pose.base_from_flange
         if matrix is not None and np.shape(np.array(matrix, dtype=object)) != (4, 4):

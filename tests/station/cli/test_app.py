@@ -91,17 +91,23 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
     assert shell.ask("retake", "2")[0] == 0 and shell.state()["session"]["poses"][1]["kept"]
     assert shell.ask("skip", "2")[0] == 0 and "kept" not in shell.state()["session"]["poses"][1]
 
-    # Ctrl-C is STOP.
+    # Ctrl-C is STOP, and so is Ctrl-Z, behind which nobody would watch.
     command = [sys.executable, "-m", "station.cli", "capture", "--plan", str(plan), "--headless"]
-    capture = subprocess.Popen(
-        [*command, "--socket", str(shell.socket)], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
-    wait_until(lambda: shell.state()["state"] in RUNNING)
-    capture.send_signal(signal.SIGINT)
-    said = capture.communicate(timeout=PATIENCE_S)[1]
-    assert capture.returncode == 130 and "station acknowledge" in said
-    status = shell.state()
-    assert (status["state"], status["cause"]) == ("stopped", "stop")
+    for key in (signal.SIGINT, signal.SIGTSTP):
+        capture = subprocess.Popen(
+            [*command, "--socket", str(shell.socket)],
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        wait_until(lambda: shell.state()["state"] in RUNNING)
+        capture.send_signal(key)
+        said = capture.communicate(timeout=PATIENCE_S)[1]
+        assert capture.returncode == 130 and "station acknowledge" in said
+        status = shell.state()
+        assert (status["state"], status["cause"]) == ("stopped", "stop")
+        assert shell.ask("acknowledge")[0] == 0
+        shell.ask("finish")
 
 
 async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,10 @@ import msgspec
 import pytest
 
 from calibrate.kinematics import MODELS, forward
+from station.cell.collision import CellGeometry
+from station.cell.config import LimitsConfig
 from station.cell.errors import ConfigError
+from station.cell.limits import check_plan
 from station.cell.pose_plan import ExpectedView, Plan, PlannedPose, plan_sha256
 from station.plan.files import load_plan, save_plan
 from tests.codes import raises
@@ -66,6 +69,18 @@ def test_all_problems_are_told_at_once(tmp_path):
     text = str(caught.value)
     for part in ("twice", "not degrees", "4 rows"):
         assert part in text
+
+
+def test_joints_that_are_none_cost_no_traceback(tmp_path):
+    text = "robot: UR10\nmount: eye-in-hand\nposes:\n- {name: a, joints_rad: []}\n"
+    (tmp_path / "plan.yaml").write_text(text)
+    [problem] = check_plan(
+        load_plan(tmp_path / "plan.yaml"), None, CellGeometry(MODELS["UR10"], LimitsConfig())
+    ).problems
+    assert problem.limit == "joints"
+    (tmp_path / "plan.yaml").write_text(text.replace("[]", "[.nan, 0, 0, 0, 0, 0]"))
+    with raises("invalid-plan"):
+        load_plan(tmp_path / "plan.yaml")
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"poses: [", b"- 1\n- 2\n", b"x" * 300_000])

@@ -19,7 +19,7 @@ WEAKNESSES = (
     "late-watchdog",
     "abrupt-braking",
     "slow-braking",
-    "stop-ignored-once",
+    "first-stop-ignored",
     "swings-back",
     "hidden-protective-stop",
     "drifts-at-rest",
@@ -35,6 +35,7 @@ class WeakArm(SimulatedArm):
     ignored = braked = False
 
     def start(self, goal: Vector, speed: float, acceleration: float) -> JointMotion:
+        self.ignored = False  # each move's first stop, as a stop that was not measured is repeated
         return super().start(goal, speed * (FASTER if self.weakness == "too-fast" else 1), acceleration)
 
     def brake(self, deceleration_rad_s2: float) -> None:
@@ -44,7 +45,7 @@ class WeakArm(SimulatedArm):
         if not self.moving:
             return
         self.braked = True
-        if self.weakness == "stop-ignored-once" and not self.ignored:
+        if self.weakness == "first-stop-ignored" and not self.ignored:
             self.ignored = True
         elif self.weakness == "abrupt-braking":
             self.freeze()

@@ -57,7 +57,7 @@ async def test_a_stop_that_is_ignored_ends_the_test_and_the_arm_is_stopped_all_t
         "UR10",
         truth=short_folder / "truth.json",
         module="tests.weak_controller",
-        options=("--weakness", "stop-ignored-once"),
+        options=("--weakness", "first-stop-ignored"),
     )
     rig = SystemRig(deaf, short_folder, tmp_path)
     try:

@@ -98,7 +98,7 @@ FOUND = {
     "late-watchdog": (StopWay.FROZEN, "reaction"),
     "abrupt-braking": (StopWay.DASHBOARD, "deceleration"),
     "slow-braking": (StopWay.DASHBOARD, "rest"),
-    "stop-ignored-once": (StopWay.DASHBOARD, "reaction"),
+    "first-stop-ignored": (StopWay.DASHBOARD, "reaction"),
     "swings-back": (StopWay.CONTROL, "back after the stop"),
     "hidden-protective-stop": (StopWay.KILLED, "held by safety"),
     "drifts-at-rest": (StopWay.CONTROL, "drift at rest"),

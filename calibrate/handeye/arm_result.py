@@ -6,8 +6,8 @@ import numpy as np
 
 from calibrate.geometry import Array, difference, perturb
 from calibrate.handeye.arm import ArmPostures
+from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
-from calibrate.handeye.estimate import CellFit
 from calibrate.handeye.solution import ArmRefusal, ArmResult, UncorrectedArm
 from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
 

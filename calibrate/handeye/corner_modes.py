@@ -37,9 +37,9 @@ class CornerModes:
     """Positions of lens and shape among the shared unknowns."""
 
     @classmethod
-    def of(cls, blocks: CornerBlocks, H: Array, shared: slice) -> CornerModes:
-        """Eliminate the board poses; H: (n, 6, 6) LL⁻¹."""
-        free = blocks.without_boards(H)
+    def of(cls, blocks: CornerBlocks, U: Array, shared: slice) -> CornerModes:
+        """Eliminate the board poses; U: (n, 6, 6) LL⁻¹."""
+        free = blocks.without_boards(U)
         left = np.maximum(blocks.rr - np.einsum("ni,ni->n", blocks.Lr, free.to_optimum), 0.0)
         return cls(free, blocks.GG, left / INFORMATION, blocks.rows / INFORMATION, shared)
 

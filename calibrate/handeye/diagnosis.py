@@ -9,8 +9,9 @@ from scipy import special
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, skew
+from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
-from calibrate.handeye.estimate import FULL, CellFit, estimate
+from calibrate.handeye.estimate import FULL, estimate
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.solution import Finding

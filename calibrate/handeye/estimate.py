@@ -13,17 +13,14 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, difference
-from calibrate.handeye.arm import ArmPostures
-from calibrate.handeye.axxb.global_start import GlobalResult
-from calibrate.handeye.axxb.pairs import Pairs
+from calibrate.geometry import Array
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corner_modes import STUDENT
 from calibrate.handeye.linear import MAX_STEPS, Fit, Linear
 from calibrate.handeye.noise_scales import WIDE, Scales
 from calibrate.handeye.priors import KnownBefore, Priors
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
-from calibrate.views import Observations, ViewSet
+from calibrate.views import Observations
 
 REJECTED = 0.05
 """Probability, of noise up to three times the usual, at or below which a view is rejected."""
@@ -155,47 +152,3 @@ def corner_weights(observed: Observations, state: CellState, sigma_px: float) ->
     distance = corner_distance(corner_residuals(observed, state.camera, state.C, state.shape))
     square = (np.nan_to_num(distance, nan=1e6, posinf=1e6) / sigma_px) ** 2
     return (STUDENT + 2) / (STUDENT + square) * observed.present
-
-
-@dataclass(frozen=True, eq=False)
-class CellFit:
-    """Result of `fit_cell`: the estimate and what is needed to judge it."""
-
-    views: ViewSet
-    """The input, with boards rotated onto themselves where their corner order disagreed."""
-    turned: tuple[int, ...]
-    """Indices of the views whose board was rotated."""
-    observed: Observations
-    priors: Priors
-    estimate: Estimate
-    log_bayes: float | None
-    """Log evidence of systematic errors of arm and bracket; None where they were not modelled."""
-    arm: ArmPostures | None
-    """None where errors of the arm's links are not among them."""
-    plain: Estimate
-    """The estimate without systematic errors of arm and bracket."""
-    smooth: Estimate | None
-    """The estimate for flanges that err smoothly, whatever the joints say; None as `log_bayes`."""
-    pairs: Pairs
-    """Pairs of the views that count."""
-    certified: GlobalResult
-    """Optimum of the quadratic objective over these pairs."""
-    arm_failure: str = ""
-    """Why systematic errors could not be fitted, where that failed."""
-    joints_note: str = ""
-    """What is unusual about the recorded joints."""
-
-    @property
-    def unknown_arm(self) -> Array:
-        """Compute what errors of an arm of unknown kinematics add to the covariance (6, 6) of X.
-
-        X stays where it fits the flanges as they are told. Its distance from the mean with smooth errors is
-        error.
-        """
-        if self.arm is not None or self.smooth is None:
-            return np.zeros((6, 6))
-        found, smooth = self.estimate, self.smooth
-        off = difference(smooth.state.X, found.state.X)
-        added = smooth.covariance[:6, :6] + np.outer(off, off) - found.covariance[:6, :6]
-        values, vectors = np.linalg.eigh((added + added.T) / 2)
-        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

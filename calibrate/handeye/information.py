@@ -69,7 +69,7 @@ def view_information(
     state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), np.zeros(errors.shape[2]))
     linear = Linear.at(observed, state, observed.present, information=1.0)
     robot = np.repeat([noise.robot_m, noise.robot_rad], 3) ** 2
-    W = np.linalg.inv(noise.corner_px**2 * linear.B + np.diag(robot))
+    W = np.linalg.inv(noise.corner_px**2 * linear.V + np.diag(robot))
     J_t = np.swapaxes(linear.J, 1, 2)
     information = J_t @ W @ linear.J
     if linear.modes is not None:

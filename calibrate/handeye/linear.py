@@ -1,7 +1,7 @@
 """The posterior linearised at one state, with the board poses eliminated.
 
 A view's board pose C_i is eliminated exactly. What is left of the view is a robot residual m_i with
-covariance S = τ² B + D: B from the corners (`corner_modes`), D the robot's own noise (`mixture`).
+covariance S = τ² V + D: V from the corners (`corner_modes`), D the robot's own noise (`mixture`).
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class LinearSolution:
 class Linear:
     """The posterior around one state."""
 
-    H: Array
+    U: Array
     """(n, 6, 6) covariance of each board pose by its own corners, for corner noise of 1 px."""
-    A: Array
+    J_C: Array
     """(n, 6, 6) ∂m/∂C"""
     m: Array
     """(n, 6) robot residual with each board pose at its own corners' optimum."""
@@ -65,10 +65,10 @@ class Linear:
     """None where the input holds board poses without corners."""
 
     @cached_property
-    def B(self) -> Array:
+    def V(self) -> Array:
         """Covariance (n, 6, 6) of m by corner noise of 1 px."""
-        B = self.A @ self.H @ np.swapaxes(self.A, 1, 2)
-        return np.asarray((B + np.swapaxes(B, 1, 2)) / 2)
+        V = self.J_C @ self.U @ np.swapaxes(self.J_C, 1, 2)
+        return np.asarray((V + np.swapaxes(V, 1, 2)) / 2)
 
     @classmethod
     def at(
@@ -81,17 +81,17 @@ class Linear:
         at, n = Layout.of(state), len(observed)
         m = flange_residuals(observed, state)
         bare = m + observed.by_arm_errors @ state.arm_errors
-        by_X, by_Y, A = flange_derivatives(observed.mount, state.X, state.Y, state.C, bare)
+        by_X, by_Y, J_C = flange_derivatives(observed.mount, state.X, state.Y, state.C, bare)
         J = np.zeros((n, 6, at.size))
         J[..., at.X], J[..., at.Y] = by_X, by_Y
         J[..., at.arm_errors] = -observed.by_arm_errors
         if not observed.has_pixels:
-            return cls(np.zeros((n, 6, 6)), A, m, J)
+            return cls(np.zeros((n, 6, 6)), J_C, m, J)
         blocks = linearise_corners(observed, state.camera, state.C, information * weights, True, state.shape)
-        H = np.asarray(np.linalg.inv(blocks.LL), dtype=float)
-        modes = CornerModes.of(blocks, H, slice(at.lens.start, at.shape.stop))
-        J[..., modes.shared] = -A @ modes.free.by_shared
-        return cls(H, A, m + (A @ modes.free.to_optimum[..., None])[..., 0], J, modes)
+        U = np.asarray(np.linalg.inv(blocks.LL), dtype=float)
+        modes = CornerModes.of(blocks, U, slice(at.lens.start, at.shape.stop))
+        J[..., modes.shared] = -J_C @ modes.free.by_shared
+        return cls(U, J_C, m + (J_C @ modes.free.to_optimum[..., None])[..., 0], J, modes)
 
     def first_scales(self, wide: float = WIDE) -> Scales:
         """Take initial noise scales from the medians of the residuals, the robot's times `wide`.
@@ -127,7 +127,7 @@ class Linear:
                 before, scales = scales, update_robot(scales, chances, z, P)
                 if fit == "all" and modes is not None:
                     sigma2, lambda2 = modes.variances(before.lambda_px, covariance, step)
-                    scales = update_corners(scales, chances, z, P, self.B, sigma2, lambda2)
+                    scales = update_corners(scales, chances, z, P, self.V, sigma2, lambda2)
         _, log_density = class_chances(residual, S, S_inverse, scales.shares)
         # Quadratic in the step, so its gain over the point of linearisation is right·step - ½ step·N·step.
         evidence = (
@@ -139,7 +139,7 @@ class Linear:
 
     def noise(self, scales: Scales) -> tuple[Array, Array]:
         """Compute the covariances (n, K, 6, 6) of m for each class, and their inverses."""
-        S = scales.tau_px**2 * self.B[:, None] + scales.classes[:, :, None] * np.eye(6)
+        S = scales.tau_px**2 * self.V[:, None] + scales.classes[:, :, None] * np.eye(6)
         return S, np.asarray(np.linalg.inv(S), dtype=float)
 
     def weights(self, chances: Array, scales: Scales) -> Array:
@@ -153,7 +153,7 @@ class Linear:
     def board_step(self, solved: LinearSolution) -> Array:
         """Compute the step (n, 6) of the board poses that belongs to the step of the shared unknowns."""
         pull = np.einsum("nk,nki->ni", solved.chances, solved.z)
-        by_robot = np.einsum("nij,nkj,nk->ni", self.H, self.A, pull)
+        by_robot = np.einsum("nij,nkj,nk->ni", self.U, self.J_C, pull)
         step = -(solved.scales.tau_px**2) * by_robot
         if self.modes is not None:
             step += self.modes.free.board_step(solved.step[self.modes.shared])
@@ -174,7 +174,7 @@ class Linear:
 
     def predicted(self, scales: Scales, covariance: Array) -> Array:
         """Predict the covariance (n, 6, 6) of m for ordinary views outside the fit of `covariance` (G, G)."""
-        noise = scales.tau_px**2 * self.B + np.diag(scales.classes[0])
+        noise = scales.tau_px**2 * self.V + np.diag(scales.classes[0])
         return np.asarray(noise + self.J @ covariance @ np.swapaxes(self.J, 1, 2))
 
     def noise_parts(self, solved: LinearSolution, covariance: Array) -> Array:
@@ -182,7 +182,7 @@ class Linear:
         W = expected(solved.chances, self.noise(solved.scales)[1])
         gain = covariance[:6] @ np.swapaxes(self.J, 1, 2) @ W
         m, rad = np.diag(solved.scales.classes[0]) * np.repeat(np.eye(2), 3, axis=1)[:, None]
-        sources = (solved.scales.tau_px**2 * self.B, m, rad)
+        sources = (solved.scales.tau_px**2 * self.V, m, rad)
         parts = [(gain @ source @ np.swapaxes(gain, 1, 2)).sum(axis=0) for source in sources]
         return np.array([float(np.trace(np.linalg.solve(covariance[:6, :6], part))) for part in parts])
 

@@ -72,12 +72,12 @@ def update_robot(scales: Scales, chances: Array, z: Array, P: Array) -> Scales:
 
 
 def update_corners(
-    scales: Scales, chances: Array, z: Array, P: Array, B: Array, sigma2: float, lambda2: float
+    scales: Scales, chances: Array, z: Array, P: Array, V: Array, sigma2: float, lambda2: float
 ) -> Scales:
-    """Update τ, and take over σ² and λ² (px²). B: (n, 6, 6) covariance of m by corners of 1 px."""
+    """Update τ, and take over σ² and λ² (px²). V: (n, 6, 6) covariance of m by corners of 1 px."""
     tau2 = scales.tau_px**2
-    found = np.einsum("nk,nki,nij,nkj->", chances, z, B, z)
-    predicted = np.einsum("nk,nkij,nji->", chances, P, B)
+    found = np.einsum("nk,nki,nij,nkj->", chances, z, V, z)
+    predicted = np.einsum("nk,nkij,nji->", chances, P, V)
     tau2 *= float((found + MODE_COUNT * lambda2 / tau2**2) / (predicted + MODE_COUNT / tau2))
     tau, lambda_, sigma = np.sqrt([max(tau2, lambda2), lambda2, sigma2]).tolist()
     return replace(scales, tau_px=tau, lambda_px=lambda_, sigma_px=sigma)

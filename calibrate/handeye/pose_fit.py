@@ -206,11 +206,11 @@ def pose_views(views: ViewSet, focal_sigma: float, size_sigma: float) -> PoseVie
             np.zeros((len(C), 6, 6)),
         )
     blocks = linearise_corners(observed, views.camera, C, observed.present, with_lens=True)
-    H = np.asarray(np.linalg.inv(blocks.LL), dtype=float)
-    modes = CornerModes.of(blocks, H, slice(0))
+    U = np.asarray(np.linalg.inv(blocks.LL), dtype=float)
+    modes = CornerModes.of(blocks, U, slice(0))
     focal = -modes.free.by_shared[..., :2] @ intrinsics_vector(views.camera)[:2]
     boards = BoardPoses(C, np.stack([size, focal]), np.array([size_sigma, focal_sigma]))
-    return PoseViews(views.mount, observed.flange, boards, modes.typical_px**2 * H)
+    return PoseViews(views.mount, observed.flange, boards, modes.typical_px**2 * U)
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,8 +288,8 @@ def _linearise(views: PoseViews, X: Array, Y: Array, factors: Array) -> Linear:
     of_X, of_Y = later * (len(X) > 1), later * (len(Y) > 1)
     C = views.boards.at(factors)
     m = difference(implied_flange(views.mount, X[of_X], Y[of_Y], C), views.flange)
-    by_X, by_Y, A = flange_derivatives(views.mount, X[of_X], Y[of_Y], C, m)
+    by_X, by_Y, J_C = flange_derivatives(views.mount, X[of_X], Y[of_Y], C, m)
     columns = [np.where((of_X == part)[:, None, None], by_X, 0.0) for part in range(len(X))]
     columns += [np.where((of_Y == part)[:, None, None], by_Y, 0.0) for part in range(len(Y))]
-    columns += [A @ motion[..., None] for motion in views.boards.motion]
-    return Linear(views.covariance, A, m, np.concatenate(columns, axis=2))
+    columns += [J_C @ motion[..., None] for motion in views.boards.motion]
+    return Linear(views.covariance, J_C, m, np.concatenate(columns, axis=2))

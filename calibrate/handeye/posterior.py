@@ -16,8 +16,8 @@ from calibrate.handeye.arm import (
     smooth_motion,
 )
 from calibrate.handeye.axxb.pairs import mount_poses
+from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import CellState, Layout
-from calibrate.handeye.estimate import CellFit
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.pose_fit import central_pose
 from calibrate.handeye.priors import BoardTolerance, KnownBefore

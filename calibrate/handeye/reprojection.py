@@ -35,9 +35,9 @@ class CornerBlocks:
     rows: Array
     """(n,) twice the weighted number of corners."""
 
-    def without_boards(self, H: Array) -> Eliminated:
-        """Eliminate the board poses; H (n, 6, 6): LL⁻¹, or the inverse of a damped LL."""
-        to_optimum, by_shared = (H @ self.Lr[..., None])[..., 0], H @ self.LG
+    def without_boards(self, U: Array) -> Eliminated:
+        """Eliminate the board poses; U (n, 6, 6): LL⁻¹, or the inverse of a damped LL."""
+        to_optimum, by_shared = (U @ self.Lr[..., None])[..., 0], U @ self.LG
         GL = np.swapaxes(self.LG, 1, 2)
         right = self.Gr - (GL @ to_optimum[..., None])[..., 0]
         return Eliminated(to_optimum, by_shared, self.GG - GL @ by_shared, right)

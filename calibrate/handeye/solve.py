@@ -15,6 +15,7 @@ from calibrate.handeye.axxb.certificate import TOLERANCE, certify
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective, pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
+from calibrate.handeye.cell_fit import STAGES, CellFit, fit_cell
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.diagnosis import (
@@ -25,8 +26,7 @@ from calibrate.handeye.diagnosis import (
     judge_board,
     judge_lens,
 )
-from calibrate.handeye.estimate import FULL, CellFit, estimate
-from calibrate.handeye.fit import STAGES, fit_cell
+from calibrate.handeye.estimate import FULL, estimate
 from calibrate.handeye.metrics import (
     FEWEST_FITTED,
     HELD_OUT,

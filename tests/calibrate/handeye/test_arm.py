@@ -12,8 +12,8 @@ from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye import arm_fit
 from calibrate.handeye import fit as fit_module
 from calibrate.handeye.arm import arm_postures, flex_motion, gravity_in_flange
+from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.estimate import Estimate, MeanParts
-from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import solve_views
 from calibrate.views import ViewSet

@@ -9,9 +9,9 @@ from calibrate.gates import judge
 from calibrate.geometry import perturb
 from calibrate.handeye import diagnosis
 from calibrate.handeye import solve as profile_robust
+from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.diagnosis import cross_validate
 from calibrate.handeye.estimate import estimate
-from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.metrics import HELD_OUT
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import SolveOptions, solve_views

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibrate.errors import PosesDisagreeError
-from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
-from calibrate.handeye.arm import arm_postures, flange_extent, flex_motion, smooth_motion
+from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
+from calibrate.handeye.arm import ArmPostures, arm_postures, flange_extent, flex_motion, smooth_motion
 from calibrate.handeye.arm_fit import estimate_with_arm_errors
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.cell_state import CellState
-from calibrate.handeye.estimate import CellFit, Estimate, estimate
+from calibrate.handeye.estimate import Estimate, estimate
 from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.pose_fit import BoardPoses, agreed_start, pose_distances
 from calibrate.handeye.priors import Priors
@@ -33,6 +33,50 @@ _CLEARLY = 5.0
 """Log evidence by which the estimate from the narrow start must beat the one from the wide start."""
 MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
 """Above this robot noise (1σ per axis, metres and radians) the poses are refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellFit:
+    """Result of `fit_cell`: the estimate and what is needed to judge it."""
+
+    views: ViewSet
+    """The input, with boards rotated onto themselves where their corner order disagreed."""
+    turned: tuple[int, ...]
+    """Indices of the views whose board was rotated."""
+    observed: Observations
+    priors: Priors
+    estimate: Estimate
+    log_bayes: float | None
+    """Log evidence of systematic errors of arm and bracket; None where they were not modelled."""
+    arm: ArmPostures | None
+    """None where errors of the arm's links are not among them."""
+    plain: Estimate
+    """The estimate without systematic errors of arm and bracket."""
+    smooth: Estimate | None
+    """The estimate for flanges that err smoothly, whatever the joints say; None as `log_bayes`."""
+    pairs: Pairs
+    """Pairs of the views that count."""
+    certified: GlobalResult
+    """Optimum of the quadratic objective over these pairs."""
+    arm_failure: str = ""
+    """Why systematic errors could not be fitted, where that failed."""
+    joints_note: str = ""
+    """What is unusual about the recorded joints."""
+
+    @property
+    def unknown_arm(self) -> Array:
+        """Compute what errors of an arm of unknown kinematics add to the covariance (6, 6) of X.
+
+        X stays where it fits the flanges as they are told. Its distance from the mean with smooth errors is
+        error.
+        """
+        if self.arm is not None or self.smooth is None:
+            return np.zeros((6, 6))
+        found, smooth = self.estimate, self.smooth
+        off = difference(smooth.state.X, found.state.X)
+        added = smooth.covariance[:6, :6] + np.outer(off, off) - found.covariance[:6, :6]
+        values, vectors = np.linalg.eigh((added + added.T) / 2)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:

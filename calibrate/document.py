@@ -58,16 +58,13 @@ def make_calibration(
     """`options`: the choices that differ from the defaults."""
     info = recording.info
     arm = None if solution.arm is None else solution.arm.result
-    X, covariance = solution.parent_from_child, solution.covariance
-    if solution.arm is not None and (as_it_is := solution.arm.installed) is not None:
-        # Beside uncorrected flanges that X is worse than one that knows nothing of the arm's errors.
-        X, covariance = Transform(X.parent, X.child, as_it_is.X), as_it_is.covariance
+    frames, (X, covariance) = solution.parent_from_child, solution.installed
     return Calibration(
         format=FORMAT,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         source=info.source,
         mount=solution.mount,
-        result=FramePose.of(X),
+        result=FramePose.of(Transform(frames.parent, frames.child, X)),
         sigma=Sigma.of(covariance),
         covariance=tuple(tuple(row) for row in covariance.tolist()),
         confidence_threshold=float(solution.confidence_threshold),

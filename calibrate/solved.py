@@ -37,8 +37,11 @@ class Solved:
 
     @property
     def X(self) -> Array:
-        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), (4, 4), metres."""
-        return self.solution.matrix
+        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), (4, 4), metres.
+
+        For the arm as it is, like a calibration file.
+        """
+        return self.solution.installed[0]
 
     @property
     def lens(self) -> CameraModel:
@@ -55,7 +58,7 @@ class Solved:
         """
         require_choice("order", order, ("translation-rotation", "rotation-translation"))
         shift = 3 * (order == "rotation-translation")
-        return np.roll(self.solution.covariance, (shift, shift), (0, 1))
+        return np.roll(self.solution.installed[1], (shift, shift), (0, 1))
 
     @cached_property
     def residuals_px(self) -> dict[int, Array]:

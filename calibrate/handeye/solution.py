@@ -275,7 +275,18 @@ class Solution:
 
     @property
     def matrix(self) -> Array:
+        """X of the fit: of the corrected arm where errors of the arm are detected."""
         return self.parent_from_child.matrix
+
+    @property
+    def installed(self) -> tuple[Array, Array]:
+        """X (4, 4) and its covariance (6, 6) for use beside the controller's flanges.
+
+        Where errors of the arm are detected, the fit's own X is worse there than one that knows nothing of
+        them.
+        """
+        as_it_is = None if self.arm is None else self.arm.installed
+        return (self.matrix, self.covariance) if as_it_is is None else (as_it_is.X, as_it_is.covariance)
 
     @property
     def sigma_translation_m(self) -> float:

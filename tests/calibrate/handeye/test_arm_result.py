@@ -18,6 +18,7 @@ from calibrate.handeye.solve import solve_views
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import MODELS, forward, with_near_axes
+from calibrate.solved import Solved
 from tests.calibrate.cells import MOUNTS, QUICK
 from tests.calibrate.worn_cell import Worn, worn_cell
 
@@ -67,6 +68,9 @@ def test_the_table_with_its_own_x_is_best_at_new_poses(worn: Worn, solved: Solut
     assert both < 0.6 * uncorrected
     assert table.error_m < 0.7 * as_it_is(solved).error_m
     assert solved.predicted_error_m == as_it_is(solved).error_m, "that of the X which is installed"
+    told = Solved(worn.views, solved, ())
+    np.testing.assert_array_equal(told.X, as_it_is(solved).X)
+    np.testing.assert_array_equal(told.covariance(), as_it_is(solved).covariance)
 
 
 def test_held_out_poses_elsewhere_say_the_same(solved: Solution) -> None:

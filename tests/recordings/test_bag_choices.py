@@ -16,7 +16,6 @@ from recordings.importers.messages import FrameMessage, ImageMessage, JointMessa
 from recordings.importers.selection import Selection, Wanted, select
 
 STEPS = 20
-ARM = tuple(f"joint_{n}" for n in range(1, 7))
 
 
 def frame(stamp: int, parent: str, child: str, R: Rotation, at: tuple[float, float, float]) -> FrameMessage:
@@ -99,7 +98,7 @@ def joints(names: tuple[str, ...], *positions: tuple[float, ...]) -> list[JointM
 
 
 def test_joints_come_by_their_numbers_and_what_is_no_number_is_passed_over() -> None:
-    names, q, nothing = (*ARM[::-1], "gripper"), (6.0, 5, 4, 3, 2, 1, 9), (np.nan,) * 7
+    names, q, nothing = (*"654321", "gripper"), (6.0, 5, 4, 3, 2, 1, 9), (np.nan,) * 7
     track = chosen(__joints=joints(names, (), nothing, q)).joints
     assert track is not None
     np.testing.assert_array_equal(track.positions_rad, [[1, 2, 3, 4, 5, 6]])

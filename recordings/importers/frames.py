@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from array import array
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -26,6 +25,8 @@ KNOWN_PAIRS = (
 `tool0` is the controller's flange, against which ROS's `flange` is turned. `tool0_controller` of a UR is its
 TCP, which holds the pendant's tool.
 """
+_TURNED = {"base_link": "base", "flange": "tool0"}
+"""Frames of ROS → the controller's, which exports name."""
 _UNIT_TOLERANCE = 0.01
 
 
@@ -86,9 +87,8 @@ class FrameTree:
     def _above(self, name: str) -> dict[str, list[tuple[str, str]]]:
         """Frames above one, itself included, and the edges that lead up to each."""
         found: dict[str, list[tuple[str, str]]] = {name: []}
-        waiting = deque([name])
-        while waiting:
-            child = waiting.popleft()
+        waiting = [name]
+        for child in waiting:
             for pair in self.edges:
                 if pair[1] == child and pair[0] not in found:
                     found[pair[0]] = [*found[child], pair]
@@ -96,12 +96,21 @@ class FrameTree:
         return found
 
     def find(self, base: str | None, flange: str | None) -> tuple[str, str]:
-        """The names of base and flange: as given, or the best known pair that a moving chain joins."""
+        """The names of base and flange, given or known, that a moving chain joins, as the controller's."""
         for known_base, known_flange in KNOWN_PAIRS:
-            pair = (base or known_base, flange or known_flange)
+            pair = self._own(base or known_base), self._own(flange or known_flange)
             if any(self.moves(edge) for edge, _ in self.chain(*pair)):
                 return pair
         raise self._no_chain(base or "a known base", flange or "a known flange")
+
+    def _own(self, name: str) -> str:
+        """The controller's frame, where it stands still to this one of ROS; else the frame itself."""
+        for turned, own in _TURNED.items():
+            beside = name.removesuffix(turned) + own
+            links = self.chain(name, beside) if name.endswith(turned) else []
+            if links and not any(self.moves(edge) for edge, _ in links):
+                return beside
+        return name
 
     def _no_chain(self, base: str, flange: str) -> ImportSourceError:
         names = ", ".join(sorted({name for pair in self.edges for name in pair})) or "none"

@@ -15,22 +15,7 @@ With corners in each `BoardView` and a camera, the same call also estimates lens
 `compare_all` puts the published methods beside it, `view_information` tells what poses would show before
 they are recorded. Errors are `calibrate.errors.CalibrationError`s with `code`, `values` and `remedy`.
 Everything else is private. Names are loaded at their first use.
-
-To read it, follow a solve; docs/contributor/solver.md has the equations:
-
-    solve.py        `solve_views`: the fit, then everything that is said of it
-      cell_fit.py   `fit_cell`: from views to the estimate of a cell, by
-        axxb/         the X of all pairs, proven; the paper's and other methods for A X = X B
-        pose_fit.py   `agreed_start` where most views agree; `fit_poses`, a quick fit without corners
-        estimate.py   `estimate`: Gauss-Newton over all unknowns (`cell_state.py`), each step by
-          linear.py     `Linear`: the likelihood at one state, board poses eliminated: step and noise
-                        (`reprojection.py`, `corner_modes.py`, `mixture.py`, `noise_scales.py`, `priors.py`)
-        arm_fit.py    the same with errors of arm and bracket (`arm.py`), averaged over their sizes
-      readings.py   where the views disagree: the recording as it might be meant, by `fit_poses`
-      diagnosis.py, metrics.py, uncertainty.py, arm_result.py, workspace.py    how good it is, and why
-      posterior.py  what later checks begin with
-    corner_fit.py   lens and board poses by the corners alone, before any solve
-    peers.py        published methods beside it; information.py    what poses would tell
+To read the code begin with `solve`.
 """
 
 from typing import TYPE_CHECKING

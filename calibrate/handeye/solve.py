@@ -1,4 +1,21 @@
-"""The solver: views in, a `Solution` with uncertainty, checks and warnings out."""
+"""The solver: views in, a `Solution` with uncertainty, checks and warnings out.
+
+Where to find what, in the order of a solve; docs/contributor/solver.md has the equations:
+
+    solve.py        `solve_views`: the fit, then everything that is said of it
+      cell_fit.py   `fit_cell`: from views to the estimate of a cell, by
+        axxb/         the X of all pairs, proven; the paper's and other methods for A X = X B
+        pose_fit.py   `agreed_start` where most views agree; `fit_poses`, a quick fit without corners
+        estimate.py   `estimate`: Gauss-Newton over all unknowns (`cell_state.py`), each step by
+          linear.py     `Linear`: the likelihood at one state, board poses eliminated: step and noise
+                        (`reprojection.py`, `corner_modes.py`, `mixture.py`, `noise_scales.py`, `priors.py`)
+        arm_fit.py    the same with errors of arm and bracket (`arm.py`), averaged over their sizes
+      readings.py   where the views disagree: the recording as it might be meant, by `fit_poses`
+      diagnosis.py, metrics.py, uncertainty.py, arm_result.py, workspace.py    how good it is, and why
+      posterior.py  what later checks begin with
+    corner_fit.py   lens and board poses by the corners alone, before any solve
+    peers.py        published methods beside it; information.py    what poses would tell
+"""
 
 from __future__ import annotations
 

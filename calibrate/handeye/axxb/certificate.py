@@ -1,9 +1,9 @@
 """Proof that a rotation is the global minimum of the quadratic objective, by its SDP relaxation.
 
-Shor's relaxation of min zᵀ S z, z = [vec Q; 1], Q in SO(3): rows and columns orthonormal and right-handed,
-30 quadratic equations of which 20 are independent. Any multipliers y give a rigorous lower bound
+Shor's relaxation of min ζᵀ S ζ, ζ = [vec R; 1], R in SO(3): rows and columns orthonormal and right-handed,
+30 quadratic equations ζᵀ Q ζ = 0 of which 20 are independent. Any multipliers μ and number ℓ give a bound
 
-    f(Q) ≥ γ + 4 · min(0, λ_min(S - Σ y_i C_i - γ E)),   because ‖z‖² = 4 on SO(3),
+    f(R) ≥ ℓ + 4 · min(0, least eigenvalue of S - Σ μ_k Q_k, less ℓ in its last place),   as ‖ζ‖² = 4,
 
 so the proof rests on one eigenvalue, not on the SDP solver's tolerance. Clarabel finds y; one linear
 correction makes the candidate an exact null vector (stationarity), which brings the gap from the solver's
@@ -64,11 +64,11 @@ def _in_candidate_frame(objective: QuadraticObjective) -> Array:
     return np.asarray(T.T @ objective.reduced() @ T)
 
 
-def _bound(S: Array, y: Array, gamma: float) -> float:
-    """Compute the lower bound that the multipliers y (20,) prove."""
+def _bound(S: Array, y: Array, at: float) -> float:
+    """Compute the lower bound that the multipliers y (20,) prove; `at`: ℓ."""
     M = S - np.tensordot(y, _constraints(), axes=1)
-    M[9, 9] -= gamma
-    return gamma + 4.0 * min(0.0, float(np.linalg.eigvalsh(M)[0]))
+    M[9, 9] -= at
+    return at + 4.0 * min(0.0, float(np.linalg.eigvalsh(M)[0]))
 
 
 def _stationary(S: Array, y: Array, candidate: Array, f: float) -> Array:
@@ -80,7 +80,7 @@ def _stationary(S: Array, y: Array, candidate: Array, f: float) -> Array:
 
 
 def _solve_dual(S: Array) -> tuple[Array, Array]:
-    """Maximise γ with S - Σ y_i C_i - γ E positive semidefinite; return y (20,), moment matrix (10, 10)."""
+    """Maximise ℓ with the bound's matrix positive semidefinite; return y (20,), moment matrix (10, 10)."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_iter = 100
@@ -128,7 +128,7 @@ _ENTRIES = np.arange(9).reshape(3, 3)
 
 @cache
 def _constraints() -> Array:
-    """Build the matrices C (20, 10, 10), symmetric and orthonormal, with zᵀ C z = 0 for every rotation."""
+    """Build the matrices Q (20, 10, 10), symmetric and orthonormal, with ζᵀ Q ζ = 0 for every rotation."""
     found = []
     for index in (_ENTRIES, _ENTRIES.T):
         for a in range(3):

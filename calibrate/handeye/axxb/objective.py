@@ -1,8 +1,8 @@
 """The sum over all pairs as one quadratic form: an evaluation costs the same for 18 pairs and for 5000.
 
-With z = [vec(R - R0); b - b0; 1] (13 numbers, vec row by row) every residual of A X = X B is linear in z,
-so f(X) = zᵀ G z. G is built recentred at a closed form (R0, b0) near the optimum: there the value is
-carried by G's last entry alone and nothing cancels, unlike in a plain moment matrix.
+With ζ = [vec(R - R0); b - b0; 1] (13 numbers, vec row by row) every residual of A X = X B is linear in ζ,
+so f(X) = ζᵀ gram ζ. It is built recentred at a closed form (R0, b0) near the optimum: there the value is
+carried by its last entry alone and nothing cancels, unlike in a plain moment matrix.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GENERATORS = skew(np.eye(3))
 
 @dataclass(frozen=True, eq=False)
 class QuadraticObjective:
-    """f(R, b) = Σ rotation error² + λ Σ translation error² (eq. 16)."""
+    """f(R, b) = Σ rotation error² + w Σ translation error² (eq. 16)."""
 
     gram: Array
     """(13, 13)"""
@@ -73,7 +73,7 @@ _REST = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12]
 def build_objective(
     pairs: Pairs, form: Form = "chordal", weight: float = 1.0, centre: Array | None = None
 ) -> QuadraticObjective:
-    """Collapse pairs into the quadratic form. `weight` is λ, rad²/m²; `centre` an X (4, 4) near the optimum,
+    """Collapse pairs into the quadratic form. `weight` is w, rad²/m²; `centre` an X (4, 4) near the optimum,
     where one is known (default: Procrustes on the logarithms).
 
     log: ‖α - R β‖² with the logarithms of eqs. 12-13. chordal: ½‖R_A R - R R_B‖², which has the same small

@@ -15,7 +15,8 @@ from calibrate.handeye.axxb.pairs import Pairs
 BOX = np.array([np.pi / 2] * 3 + [1.0] * 3)
 """Upper bound of x = [γ; b] in rad and m; the lower bound is its negative (eq. 22)."""
 SETTINGS = EvolutionSettings()
-LAMBDA = 1.0
+WEIGHT = 1.0
+"""w of the equations, rad²/m²."""
 _ON_BOX = 1e-4
 """Relative distance from a bound that counts as on it: the evolution ends near a bound, not always on it."""
 NAMES = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z")
@@ -34,7 +35,7 @@ class PaperResult:
 
 def solve_paper(pairs: Pairs, seed: int) -> PaperResult:
     """Run the evolution once, seeded, on all of `pairs`; the caller has taken out those held out."""
-    objective = build_objective(pairs, "log", LAMBDA)
+    objective = build_objective(pairs, "log", WEIGHT)
     x = evolve(paper_evaluate(objective), -BOX, BOX, np.random.default_rng(seed), SETTINGS)
     X = pose(rotation_exp(x[:3]), x[3:])
     return PaperResult(X, x, objective, on_box(x))

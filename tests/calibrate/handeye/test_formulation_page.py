@@ -18,13 +18,13 @@ PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
 @pytest.mark.parametrize(
     ("figure", "value", "said"),
     [
-        (paper.LAMBDA, 1.0, "λ = 1 rad²/m²"),
-        (paper.SETTINGS.factor, 0.5, "F = 0.5, CR = 0.9, M = 30, 100 generations"),
-        (paper.SETTINGS.crossover, 0.9, "CR = 0.9"),
-        (paper.SETTINGS.population, 30, "M = 30"),
+        (paper.WEIGHT, 1.0, "w = 1 rad²/m²"),
+        (paper.SETTINGS.factor, 0.5, "mutant = p1 + 0.5 (p2 − p3)"),
+        (paper.SETTINGS.crossover, 0.9, "crossover 0.9"),
+        (paper.SETTINGS.population, 30, "30 candidates"),
         (paper.SETTINGS.generations, 100, "100 generations"),
         (paper.BOX, [np.pi / 2] * 3 + [1.0] * 3, "|γ| ≤ π/2,  |b| ≤ 1 m per component"),
-        (certificate.FLOOR, 1e-8, "max(f, 1e-8 tr S)"),
+        (certificate.FLOOR, 1e-8, "max(f, 1e-8 tr reduced)"),
         (certificate.TOLERANCE, 1e-6, "certified at ≤ 1e-6"),
         (len(certificate._constraints()), 20, "With the 20 independent equations"),
         (MAX_PAIRS, 20_000, "thinned above 20 000"),
@@ -42,7 +42,7 @@ PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
         ([arm_fit.RIGID, arm_fit.BENDS[-1]], [0.5, 1.6], "a rigid bracket counts one half, others up to 1.6"),
         (readings._CLEAR, 10.0, "10 + ln n more"),
         (drift.FALSE_ALARM, 0.05, "F⁻¹(0.95; 6, ν)"),
-        ([drift.SHIFT_M, np.degrees(drift.TURN_RAD)], [0.5e-3, 0.1], "d = 0.5 mm or 0.1°"),
+        ([drift.SHIFT_M, np.degrees(drift.TURN_RAD)], [0.5e-3, 0.1], "shift = 0.5 mm or 0.1°"),
     ],
 )
 def test_a_figure_is_the_one_on_the_page(figure: object, value: object, said: str) -> None:

@@ -64,13 +64,15 @@ def write_ros2(recording: Recording, folder: Path) -> None:
 
 
 def _entries(messages: _Messages, recording: Recording, segment: RecordingSegment) -> Iterator[_Entry]:
-    """List the entries in time order."""
+    """List the entries in time order, without images that were taken again or back."""
     counted = {view.picture_sequence: view for view in recording.views() if view.part == segment.info.part}
     stored = {message.sequence: message.log_time for message in segment.stored(Topic.PICTURE_FACTS)}
     facts = {facts.sequence: facts for facts in segment.image_facts()}
+    left_out = {view.picture_sequence for view in segment.views} - counted.keys()
     times = {
         number: _mid_exposure_ns(counted.get(number), facts[number], time_ns)
         for number, time_ns in stored.items()
+        if number not in left_out
     }
     return merge(
         _arm(messages, segment),

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from recordings import strict_yaml
 from recordings.errors import ImportSourceError, disk_error
@@ -28,7 +29,6 @@ from recordings.schema.messages import (
     Mount,
     RobotIdentity,
     SessionInfo,
-    matrix_from_quaternion,
 )
 
 DATASET_FILE = "dataset.yaml"
@@ -205,5 +205,6 @@ def _pose_row(path: Path, line: int, header: list[str], cells: list[str]) -> Pos
         raise ImportSourceError("no-unit-quaternion", path=path, line=line, length=length)
     if joints and (turn := max(map(abs, joints))) > _TURN_LIMIT_RAD:
         raise ImportSourceError("not-radians", path=path, line=line, turn=turn)
-    base_from_flange = matrix_from_quaternion(position, [q / length for q in quaternion])
-    return PoseRow(line, cells[0], base_from_flange, tuple(joints) or None)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
+    return PoseRow(line, cells[0], tuple(map(tuple, T.tolist())), tuple(joints) or None)

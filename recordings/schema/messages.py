@@ -279,15 +279,3 @@ class CaptureEvent(msgspec.Struct, frozen=True, omit_defaults=True):
     pose_index: int | None = None
     detail: str = ""
     level: Literal["debug", "info", "warning", "error"] = "info"
-
-
-def matrix_from_quaternion(position_m: list[float], quaternion_xyzw: list[float]) -> Matrix4:
-    """Unit quaternion and position → 4×4."""
-    x, y, z, w = quaternion_xyzw
-    px, py, pz = position_m
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), px),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), py),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), pz),
-        (0.0, 0.0, 0.0, 1.0),
-    )

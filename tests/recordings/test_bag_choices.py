@@ -9,37 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from scipy.spatial.transform import Rotation
 
 from recordings.importers.bags import BagTopic
 from recordings.importers.messages import FrameMessage, ImageMessage, JointMessage, Kind, decoded
 from recordings.importers.selection import Selection, Wanted, select
+from tests.recordings.test_bag_frames import frame, random_pose, turned
 
 STEPS = 20
 
 
-def frame(stamp: int, parent: str, child: str, R: Rotation, at: tuple[float, float, float]) -> FrameMessage:
-    x, y, z, w = R.as_quat().tolist()
-    return FrameMessage(stamp, parent, child, at, (x, y, z, w))
-
-
 def ur_frames() -> list[list[FrameMessage]]:
-    """As ROS 2's ur_description has them, and a controller's frame with a tool of 0.2 m."""
+    """As ROS 2's ur_description has them, and a controller's frame with a tool."""
     fixed = [
-        frame(0, "base_link", "base", Rotation.from_euler("z", np.pi), (0, 0, 0)),
-        frame(
-            0, "wrist_3_link", "flange", Rotation.from_euler("xyz", [0, -np.pi / 2, -np.pi / 2]), (0, 0, 0)
-        ),
-        frame(0, "flange", "tool0", Rotation.from_euler("xyz", [90, 0, 90], True), (0, 0, 0)),
+        frame(0, "base_link", "base", turned(np.pi)),
+        frame(0, "wrist_3_link", "flange", turned(1.0)),
+        frame(0, "flange", "tool0", turned(-1.0)),
     ]
-    moving = [
-        [
-            frame(n, "base_link", "wrist_3_link", Rotation.identity(), (-0.1 * n, 0, 0)),
-            frame(n, "base", "tool0_controller", Rotation.from_euler("z", np.pi), (0.1 * n, 0, 0.2)),
-        ]
-        for n in range(STEPS)
-    ]
-    return [fixed, *moving]
+    tools = [frame(n, "base", "tool0_controller", random_pose(n)) for n in range(STEPS)]
+    return [fixed, tools, [frame(n, "base_link", "wrist_3_link", turned(0.01 * n)) for n in range(STEPS)]]
 
 
 def calibration(
@@ -69,8 +56,7 @@ def chosen(image: str = "/cam/image_raw", wanted: Wanted | None = None, **topics
 def test_the_frames_of_a_ur_are_its_controllers(wanted: Wanted | None) -> None:
     """ROS's are turned against them, as exports know; `tool0_controller` holds the pendant's tool."""
     T = chosen(wanted=wanted).track.at(np.array([3]))[0]
-    np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("z", np.pi).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(T[:3, 3], [0.3, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(T, turned(0.03 - np.pi), atol=1e-12)
 
 
 @pytest.mark.parametrize("image", ["/cam/image_rect", "/cam/image_rect_color/compressed"])

@@ -9,16 +9,15 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from recordings.cli import main
 from recordings.exporters.export import export_recording
 from recordings.images import encode_png
+from recordings.importers.bags import open_bag
 from recordings.importers.folder import import_folder
+from recordings.importers.messages import Kind
 from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording
-from recordings.schema.messages import matrix_from_quaternion
-from recordings.schema.viewing import quaternion_xyzw
 from recordings.writer import RecordingWriter
 from tests.command_line import call
 from tests.recordings.small_recording import (
@@ -104,15 +103,15 @@ def test_the_command_line_writes_each_target(small: Path, tmp_path: Path, target
     assert (tmp_path / "out").is_dir()
 
 
-def test_quaternions_turn_as_scipy_says_and_back() -> None:
-    turns = [*Rotation.random(30, random_state=2), Rotation.from_rotvec([np.pi, 0, 0]), Rotation.identity()]
-    for turn in turns:
-        T = matrix_from_quaternion([1.0, 2.0, 3.0], turn.as_quat().tolist())
-        np.testing.assert_allclose(np.array(T)[:3, :3], turn.as_matrix(), atol=1e-12)
-        assert [row[3] for row in T[:3]] == [1, 2, 3]
-        q = quaternion_xyzw(T)
-        assert q[3] >= 0
-        np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), turn.as_matrix(), atol=1e-12)
+def test_what_a_person_took_back_stays_out_of_a_bag(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        for index in range(2):
+            writer.image(make_picture(index))
+            writer.view(make_view(index))
+        writer.view(msgspec.structs.replace(make_view(1), taken_back=True, attempt=2))
+        recording = open_recording(writer.finish())
+    bag = open_bag(export_recording(recording, tmp_path / "out", "ros2"))
+    assert [topic.messages for topic in bag.topics.values() if topic.kind is Kind.IMAGE] == [1]
 
 
 @pytest.mark.parametrize("encoded", [None, encode_png(make_image(0))])

@@ -165,10 +165,11 @@ def solve(
         if one.size is not None:
             require_size(camera, one.size, i, f"picture {i}")
     found, intrinsics = with_board_poses(ViewSet(mount, views, camera, robot_model), board)
+    options = options or SolveOptions()
     options = replace(
-        options or SolveOptions(),
+        options,
         intrinsics_from_same_pictures=intrinsics is not None,
-        board=BoardTolerance.of(board),
+        board=BoardTolerance.of(board, options.board),
     )
     solution = solve_views(found, options)
     return SolvedPictures(found, solution, judge(solution), without)

@@ -43,9 +43,9 @@ class BoardTolerance:
         return np.array([self.square, self.square, self.flatness_m, self.flatness_m, self.flatness_m])
 
     @classmethod
-    def of(cls, board: BoardSpec) -> BoardTolerance:
-        """Take what the board's description states, else the defaults."""
-        usual = cls()
+    def of(cls, board: BoardSpec, usual: BoardTolerance | None = None) -> BoardTolerance:
+        """Take what the board's description states, else `usual`; None: the defaults."""
+        usual = usual or cls()
         return cls(
             usual.square if board.square_tolerance is None else board.square_tolerance,
             usual.flatness_m if board.flatness_m is None else board.flatness_m,

@@ -13,6 +13,7 @@ import calibrate
 import recordings
 from calibrate.boards.detect import detect
 from calibrate.errors import CalibrationError
+from calibrate.handeye import BoardTolerance, SolveOptions
 from calibrate.job import SolvedRecording
 from calibrate.pictures import read_folder
 from calibrate.views import ViewSet
@@ -92,6 +93,16 @@ def test_views_do_not_change_with_the_callers_arrays() -> None:
     views = ViewSet.from_poses("eye-in-hand", flanges, flanges)
     flanges[:] = 0.0
     np.testing.assert_array_equal(views.base_from_flange, [np.eye(4)] * 2)
+
+
+def test_the_tolerance_of_a_board_that_states_none_is_the_one_asked_for(
+    given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[SolveOptions] = []
+    monkeypatch.setattr("calibrate.pictures.solve_views", lambda views, options: told.append(options))
+    monkeypatch.setattr("calibrate.pictures.judge", lambda solution: ())
+    calibrate.solve(**given, options=SolveOptions(board=BoardTolerance(square=1e-5)))
+    assert told[0].board == BoardTolerance(square=1e-5)
 
 
 def test_poses_are_read_by_a_convention_and_a_board_as_typed(given: dict[str, Any]) -> None:

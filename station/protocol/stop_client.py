@@ -109,8 +109,8 @@ class Outcome(Enum):
         "STOP is latched, but the robot does not tell whether it moves. If it does, press its emergency stop."
     )
     SILENT = "STOP was sent, but the station did not confirm it. Press the emergency stop."
-    NO_DAEMON = "No station daemon serves {socket}: STOP reached nobody. Press the emergency stop."
-    DENIED = "{socket}: not allowed (group station-operator is). Press the emergency stop."
+    NO_DAEMON = "STOP reached nobody: press the emergency stop. No station serves {socket}."
+    DENIED = "STOP reached nobody: press the emergency stop. {socket} is for the group station-operator."
     UNTRUSTED = "{reason} Whatever answers there may not be the station. Press the emergency stop."
 
     def told(self, control: Path, reason: str = "") -> str:

@@ -9,8 +9,7 @@ from scipy import stats
 
 from benchmarks.imperfect_cells import Imperfection, imperfect_cell
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
-from calibrate.handeye import arm_fit
-from calibrate.handeye import fit as fit_module
+from calibrate.handeye import arm_fit, cell_fit
 from calibrate.handeye.arm import arm_postures, flex_motion, gravity_in_flange
 from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.estimate import Estimate, MeanParts
@@ -133,7 +132,7 @@ def test_an_arm_that_cannot_be_fitted_is_said_and_left_out_whole(monkeypatch):
     def fails(*_):
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(fit_module, "estimate_with_arm_errors", fails)
+    monkeypatch.setattr(cell_fit, "estimate_with_arm_errors", fails)
     views = without_joints(worn_views(0.4))
     found = solve_views(replace(views, robot_model="unknown"), QUICK)
     assert found.arm is None and found.posterior.level is None

@@ -8,8 +8,7 @@ import pytest
 from rich.console import Console
 
 from station.cell.status import Event, PoseStatus, SessionStatus, StationStatus
-from station.cli import control as cli_control
-from station.cli import main
+from station.cli import main, requests
 from station.cli.session import session_progress
 from station.protocol.verbs import Check
 from tests.command_line import call
@@ -21,11 +20,11 @@ ALL = " ".join(NAMES)
 def test_what_the_daemon_tells(monkeypatch: pytest.MonkeyPatch) -> None:
     session = SessionStatus(name=ALL, recording=f"/sessions/{ALL}", poses=(PoseStatus(0, "[/]"),))
     status = StationStatus(reason=ALL, session=session)
-    monkeypatch.setattr(cli_control, "status_of", lambda socket: status)
+    monkeypatch.setattr(requests, "status_of", lambda socket: status)
     said = call(main, "status").stdout
     assert said.count(ALL) == 3
     checks = [Check("[/]", "failed", "[red]x[/]", "[/]")]
-    monkeypatch.setattr(cli_control, "ask", lambda socket, verb: checks)
+    monkeypatch.setattr(requests, "ask", lambda socket, verb: checks)
     said = call(main, "doctor").stdout
     assert "MISSING" in said and "[red]x[/]" in said and "→ [/]" in said
 

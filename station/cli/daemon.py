@@ -50,7 +50,7 @@ def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
     config = config or find_config()
     what = ["--simulate"] if config is None else ["--config", str(config)]
     cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
-    print(f"No daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
+    print(f"Starting {cell} …", file=sys.stderr)
     root.mkdir(parents=True, exist_ok=True)
     _started([*what, "--socket", str(socket)], root / "daemon.log", subprocess.DEVNULL)
     return socket

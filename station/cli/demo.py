@@ -92,7 +92,7 @@ def demo_command(
     arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]
     quiet, started_s = headless or as_json, time.monotonic()
     if not quiet:
-        err.print(f"a simulated cell: {' '.join(arguments)}", style="dim")
+        err.print(f"SIMULATED cell, seed {seed}: takes about a minute, nothing real moves.", style="dim")
     # A worn arm is worth poses that tell its table from the rest.
     plan = MakePlan(poses, seed, aim="arm" if noise == "high" else "camera")
     with simulated_daemon(folder, arguments) as socket:

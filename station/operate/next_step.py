@@ -39,7 +39,8 @@ def after_capture(session: SessionStatus) -> NextStep:
     if failed:
         causes = {pose.reason for pose in session.poses if pose.state == "failed" and pose.reason}
         why = f" ({'; '.join(sorted(causes)[:2])})" if causes else ""
-        return NextStep(StepKind.RETAKE, f"pose {', '.join(failed)} was not captured{why}")
+        which = f"pose {failed[0]} was" if len(failed) == 1 else f"poses {', '.join(failed)} were"
+        return NextStep(StepKind.RETAKE, f"{which} not captured{why}")
     if session.check:
         return NextStep(StepKind.SOLVE, "the drift check judges the installed calibration by this recording")
     return NextStep(StepKind.SOLVE, "the recording is finished")

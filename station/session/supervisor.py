@@ -179,7 +179,7 @@ class SessionSupervisor:
             if repr(error) != self._failure:
                 self._failure = repr(error)
                 log.exception("the status could not be refreshed")
-                self._context.store.problem(error, "error", said="what the screen shows is not fresh: {!r}")
+                self._context.store.problem(error, "error", said="the status could not be refreshed: {!r}")
 
     def lag_ms(self) -> float:
         """Return the largest delay of the last second, ms."""

@@ -46,7 +46,7 @@ LOOK_S = 2.0
 PREVIEW_PERIOD_S = 0.25
 LIVE_PERIOD_S = 0.1
 """Between two pictures for a browser while the arm rests."""
-HELD = "The arm works, commanded from here. It decelerates at once, and the session pauses."
+HELD = "The arm works by this screen. Closing it stops the arm at once and pauses the session."
 ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
 
 

@@ -24,7 +24,7 @@ from station.tui.installed import Result, local, state_root
 OVERRIDABLE = ("gate-failed", "objection")
 """Codes of refusals that a person may override with a reason."""
 OVERRIDES = "Your name and the reason go into the file. Enter installs, Escape does not."
-NO_VERDICT = "Another session began: the drift check has no verdict. Its views, if any, are on 5 (k)."
+NO_VERDICT = "Another session began: the drift check has no verdict. On 5, k judges the views it took."
 
 
 async def solve_session(link: DaemonLink, recording: str, folder: str) -> None:

@@ -35,8 +35,8 @@ PAGES = {
     CellStep.ROBOT: Page(
         "Which robot?",
         "Type the controller's address. The pendant shows it: the menu ☰ (top right) → About, or ☰ → "
-        "Settings → System → Network; on a CB3: Setup Robot → Network. The station only reads. Another arm, "
-        "which you move and a program tells: posted and its name, e.g. posted xArm 6.",
+        "Settings → System → Network; on a CB3: Setup Robot → Network. The station only reads. For an arm of "
+        "another make type posted and its name, e.g. posted xArm 6: you move it, a program tells its pose.",
         ("#typed",),
         "address of the controller, e.g. 192.168.1.10",
     ),

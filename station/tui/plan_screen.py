@@ -23,7 +23,7 @@ COLUMNS = ("#", "error", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); F5 makes it and asks."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
-NEW = "Plan 25 poses from the configured initial poses (seconds)"
+NEW = "Plan 25 poses: takes some seconds, nothing moves"
 NEW_PLAN = MakePlan(25, seed=1)
 POSE_VERBS = {"retake": Retake, "skip": Skip}
 

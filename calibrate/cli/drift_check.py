@@ -208,7 +208,6 @@ def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
 
 def check_text(result: DriftCheck, calibration: Calibration) -> str:
     """Verdict, shift, power of the test, and what to do."""
-    frame = f"{calibration.result.parent_frame}_from_{calibration.result.child_frame}"
     if not result.passed:
         weak = f"Weak evidence (p = {result.p_value:.3f}). Repeat the check."
         sure = "Check the camera's bracket, and calibrate again."
@@ -218,11 +217,12 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
         )
     else:
         verdict = "PASS" if result.power >= POWER else "PASS, low sensitivity"
-        text = f"{verdict}: {frame} on {result.views} new views (p = {result.p_value:.2f})."
+        text = f"{verdict}: the camera pose holds on {result.views} new views (p = {result.p_value:.2f})."
     if not result.arm_known:
         text += " The arm's own errors are unknown: a failure may be theirs. Solve with recorded joints."
-    text += f" Detection power: 0.5 mm {result.power_translation:.0%}, 0.1° {result.power_rotation:.0%}"
-    text += "; false alarms 5 %." if result.arm_known else "."
+    found = f"0.5 mm in {result.power_translation:.0%}, a turn of 0.1° in {result.power_rotation:.0%}"
+    text += f" It would find a shift of {found} of cases"
+    text += "; 5 % are false alarms." if result.arm_known else "."
     if result.passed and result.power < POWER:
         text += f" {_more_text(result, calibration)}"
     if result.disagreement > MOST_DISAGREEMENT:

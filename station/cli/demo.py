@@ -97,6 +97,8 @@ def demo_command(
     plan = MakePlan(poses, seed, aim="arm" if noise == "high" else "camera")
     with simulated_daemon(folder, arguments) as socket:
         outcome = asyncio.run(_captured(socket, plan, quiet))
+    if outcome.session.recording and not quiet:
+        err.print("Solving: some ten seconds …", style="dim")
     solved, made = _solved(outcome), Path(outcome.session.folder)
     arm = solved.arm_table
     # The camera's true pose is that on the true arm: the X of the corrected one is to be compared with it.
@@ -121,8 +123,6 @@ def demo_command(
         print_json(result)
     else:
         _show_demo(result, solved, arm is not None and arm.offered, time.monotonic() - started_s)
-        for sentence in arm_sentences(solved):
-            out.print(sentence)
     if opened:
         open_report(Path(result.report), err)
     if not result.gates_passed:
@@ -133,12 +133,13 @@ def demo_command(
 
 def _show_demo(result: DemoJson, solved: Calibration, arm_is_corrected: bool, duration_s: float) -> None:
     out.print(f"SIMULATED cell, seed {result.seed}: {result.mount}, {result.scene} scene", style="bold")
-    out.print(use_text(solved))
     off, by_table = result.truth_error, ", by the corrected arm," * arm_is_corrected
-    out.print(
+    true = (
         f"The true camera pose is known here. The found one{by_table} is off by {off.translation_mm:.3f} mm "
         f"and {off.rotation_deg:.4f}°."
     )
+    for sentence in (use_text(solved), true, *arm_sentences(solved)):
+        out.print(sentence, soft_wrap=not out.is_terminal)
     verdict = "all gates passed" if result.gates_passed else ("a gate FAILED", "red")
     taken = f"{result.poses.captured} of {result.poses.planned} poses, "
     out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))

@@ -182,8 +182,8 @@ class StationApp(LivePageApp[None], DaemonApp):
 
     async def _read_changed(self, session: SessionStatus) -> None:
         client, path = self.link.client, self.result_path
-        if not path and session.recording:
-            path = await asyncio.to_thread(solved_file, session.folder)
+        if not path and session.recording and client.root is not None:
+            path = await asyncio.to_thread(solved_file, session, client.root, client.camera)
         root = state_root(path) if path else client.root
         if root is None or (found := (path, await asyncio.to_thread(marks, root))) == self._marks:
             return

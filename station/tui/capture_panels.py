@@ -64,9 +64,7 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     estimate, poses, goal = known.shown.estimate, known.shown.session.poses, known.goal_mm
     head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:
-        head += Content.assemble(("  goal ", "$dim"), (f"{goal:g} mm", "$warn"))
-    if estimate.enough:
-        head += Content("  ") + mark("done", "reached")
+        head += Content("  ") + mark("done" if estimate.enough else "todo", f"goal {goal:g} mm")
     columns = [(p.estimated_sigma_mm or p.predicted_sigma_mm, bool(p.estimated_sigma_mm)) for p in poses]
     return lines(head, *error_columns(columns, goal, width, height - 1))
 

@@ -44,7 +44,12 @@ class CaptureScreen(StationScreen):
                 yield Line(lambda known, _: quality_line(known.shown.detection), id="quality")
             with Vertical(id="live-right"):
                 yield Panel("Poses", _progress, id="progress", below=LEGEND)
-                yield Panel("Predicted error", error_lines, id="error", below="after each pose")
+                yield Panel(
+                    "Predicted error",
+                    error_lines,
+                    id="error",
+                    below="after each pose: █ by images  : planned",
+                )
                 yield Panel("Where the board was seen", coverage_lines, id="coverage", below="images")
         yield Stopped(id="stopped")
 

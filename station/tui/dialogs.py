@@ -119,6 +119,7 @@ class Reason(Question[str]):
     Its words also say what becomes of the reason, and what Enter does.
     """
 
+    NEXT = Action("", "Type the reason", "Enter does it, Escape changes nothing.", look=True)
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "dismiss('')", "Cancel", tooltip="Change nothing")
     ]

@@ -18,7 +18,7 @@ from textual.widgets import Footer, Static
 
 from station.cell.status import StationStatus
 from station.protocol import verbs
-from station.protocol.states import LATCHED, RUNNING
+from station.protocol.states import LATCHED
 from station.protocol.verbs import Verb
 from station.tui.task import Action, Known, Step, next_action, steps
 from station.tui.words import MARKS, dim, duration, shortened, state_of
@@ -232,6 +232,20 @@ ASKS: dict[str, type[Verb[Any]]] = {
     "app.drift_check": verbs.Freedrive,
 }
 """Verb by the action of a key that asks the daemon for it."""
+NEEDS: dict[str, Callable[[Known], object]] = {
+    "solve_newest": lambda known: known.shown.session.recording and not known.result,
+    "pose('retake')": lambda known: known.shown.session.poses,
+    "pose('skip')": lambda known: known.shown.session.poses,
+    "report": lambda known: known.result,
+    "act('install')": lambda known: (
+        known.result and not (known.result.installed and not known.result.state.withdrawn)
+    ),
+    "act('touch test')": lambda known: known.result,
+    "act('undo')": lambda known: known.result and known.result.state.now,
+    "app.drift_check": lambda known: known.result and known.result.state.now,
+    **dict.fromkeys(("act('solve')", "act('check')", "act('recover')"), lambda known: known.sessions),
+}
+"""What the action of a key works on; it has none while that is empty."""
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
 """Style classes by the terminal's columns, and by its rows."""
 
@@ -256,7 +270,9 @@ class Framed(Screen[R]):
     def does_something(self, action: str) -> bool:
         """Tell whether the action of a key is possible now."""
         verb, status = ASKS.get(action), self.known.shown
-        return verb is None or (status.state in verb.states and not (verb.moves and status.robot.by_hand))
+        if verb is not None and (status.state not in verb.states or (verb.moves and status.robot.by_hand)):
+            return False
+        return action not in NEEDS or bool(NEEDS[action](self.known))
 
     def show(self, known: Known) -> None:
         """Draw every part from what is known."""
@@ -268,11 +284,14 @@ class Framed(Screen[R]):
         self.show(self.known)
 
     def _hear(self, known: Known) -> None:
-        states = {self.known.shown.state, known.shown.state}
+        before = self._possible()
         self.known = known
-        if len(states) > 1 and not states <= RUNNING:
+        if self._possible() != before:
             self.refresh_bindings()
         self.call_next(self._show_known)
+
+    def _possible(self) -> list[bool]:
+        return [self.does_something(action) for action in (*ASKS, *NEEDS)]
 
     def _show_known(self) -> None:
         # Closing, the app takes the screens' parts away before its workers end.

@@ -19,6 +19,7 @@ from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.versions import LogEntry, read_log, same_solve
 from recordings.files import MAIN_CAMERA
 from station.cell.session_folder import CALIBRATION_FILE, SessionSummary, list_sessions
+from station.cell.status import SessionStatus
 
 Marks = frozenset[tuple[str, int]]
 
@@ -101,9 +102,12 @@ def state_root(calibration: str | Path) -> Path:
     return Path(calibration).resolve().parents[2]
 
 
-def solved_file(folder: str) -> str:
-    """Return the calibration file made from a session, by whatever program; empty: none yet."""
-    path = Path(folder) / CALIBRATION_FILE
+def solved_file(session: SessionStatus, root: Path, camera: str) -> str:
+    """Return the calibration file made from a session, or judged by it as a drift check; empty: none yet."""
+    folder = Path(session.folder)
+    if session.check and (now := read_installed(root, camera).now) is not None:
+        folder = folder.with_name(now.provenance.session)
+    path = folder / CALIBRATION_FILE
     return str(path) if path.is_file() else ""
 
 

@@ -20,7 +20,7 @@ from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
 from station.tui.words import ERROR_SHOWN_MM, MARKS, UNKNOWN, dim, error_facts, facts, mark
 
 COLUMNS = ("#", "error", "state", "reason")
-NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); F5 makes it and asks."
+NO_PLAN = "No plan yet: F5 makes one and asks, n only makes it. Nothing moves."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses: takes some seconds, nothing moves"

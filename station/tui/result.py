@@ -32,7 +32,7 @@ from station.tui.task import Known
 from station.tui.touch_corners import run_touch_test
 from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, sentence, shortened
 
-NO_RESULT = "No result yet. F9 solves the session just captured; on 5, Enter shows older ones."
+NO_RESULT = "No result yet: F9 solves what was captured. On 5, Enter shows older ones."
 SHOWN = {"PASS": ("✓", "-pass"), "PASS WITH A REASON": ("▲", "-reason"), "FAIL": ("✗", "-fail")}
 BAR_CELLS, NAME_CELLS = 14, 27
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
@@ -202,27 +202,12 @@ class ResultScreen(StationScreen):
             with VerticalScroll(id="evidence-box", classes="panel"):
                 yield Static(id="evidence")
 
-    def does_something(self, action: str) -> bool:
-        result = self.known.result
-        installed = result is not None and result.state.now is not None
-        match action:
-            case "act('install')":
-                return result is not None and not (result.installed and not result.state.withdrawn)
-            case "report":
-                return result is not None
-            case "act('undo')" | "app.drift_check" if not installed:
-                return False
-            case "solve_newest":
-                return result is None
-        return super().does_something(action)
-
     def show(self, known: Known) -> None:
         super().show(known)
         result = known.result
         if result is self._drawn:
             return
         self._drawn = result
-        self.refresh_bindings()
         verdict = self.query_one("#verdict", Static)
         verdict.set_classes("" if result is None else SHOWN[result.verdict][1])
         verdict.update(Content(NO_RESULT) if result is None else verdict_lines(result))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from calibrate.files.validity import ValidityState
 from station.cell.config import StationConfig
 from station.cell.status import NO_IMAGE, DetectionStatus, GuidanceStatus, StationState, StationStatus
 from station.operate.next_step import StepKind, after_solve
@@ -267,12 +268,13 @@ def _at_rest(known: Known, status: StationStatus) -> Action:
     if session.poses and not session.recording:
         asks = f"{status.reason} Shows the motion and asks first.".strip()
         return Action("F5", "Start the capture", asks)
+    judged = result is not None and session.name in {check.recording for check in result.state.drift}
+    if session.check and session.recording and not judged:
+        return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
     if result is not None:
         return _with_result(result, status)
     if not session.poses:
         return Action("F5", "Plan and start", "Plans, shows the motion and asks first.")
-    if session.check:
-        return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
     return Action("F9", "Solve", f"{many(session.captured, 'pose')} saved; solving takes some seconds.")
 
 
@@ -284,6 +286,9 @@ def _with_result(result: Result, status: StationStatus) -> Action:
     if result.state.withdrawn and result.installed:
         why = "Withdrawn: programs are refused this one. i on 4 installs it again."
         return Action("n", "Plan 25 poses", why, at="plan", look=True)
+    validity = result.state.validity
+    if result.installed and validity is not None and validity.state is ValidityState.IN_DOUBT:
+        return Action("n", "Plan 25 poses", f"In doubt: {validity.reason.text}", at="plan", look=True)
     if result.installed:
         return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="result")
     if step.kind is StepKind.INSTALL:

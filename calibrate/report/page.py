@@ -245,7 +245,6 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
         for name, value in values
     ]
     yield html.table(("", "value", "1σ"), rows, (1, 2))
-    yield html.paragraph(f"Image coverage by corners: {job.solution.coverage:.0%}.")
 
 
 def _views(job: SolvedRecording) -> Iterator[str]:

@@ -7,8 +7,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
@@ -95,7 +93,9 @@ def demo_command(
         err.print(f"SIMULATED cell, seed {seed}: takes about a minute, nothing real moves.", style="dim")
     # A worn arm is worth poses that tell its table from the rest.
     plan = MakePlan(poses, seed, aim="arm" if noise == "high" else "camera")
-    with simulated_daemon(folder, arguments) as socket:
+    folder.mkdir(parents=True, exist_ok=True)
+    served = ["--simulate", "--root", str(folder), *arguments]
+    with own_daemon(served, folder / "daemon.log") as socket:
         outcome = asyncio.run(_captured(socket, plan, quiet))
     if outcome.session.recording and not quiet:
         err.print("Solving: some ten seconds …", style="dim")
@@ -153,12 +153,6 @@ async def _captured(socket: Path, plan: MakePlan, quiet: bool) -> StationStatus:
     async with attended(socket, headless=True, quiet=quiet) as shell:
         await shell.client.call(plan, timeout_s=PLAN_S)
         return await shell.carry_out(Purpose.RUN)
-
-
-def simulated_daemon(root: Path, arguments: Sequence[str]) -> AbstractContextManager[Path]:
-    """`station serve --simulate` as a child of this process; its socket."""
-    root.mkdir(parents=True, exist_ok=True)
-    return own_daemon(["--simulate", "--root", str(root), *arguments], root / "daemon.log")
 
 
 def _solved(outcome: StationStatus) -> Calibration:

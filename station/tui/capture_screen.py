@@ -7,12 +7,11 @@ from typing import ClassVar
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
-from textual.content import Content
 
 from station.cell.status import StationState
 from station.protocol import verbs
 from station.protocol.states import LATCHED, RUNNING
-from station.tui.capture_panels import coverage_lines, error_lines, hand_lines, quality_line
+from station.tui.capture_panels import coverage_lines, error_lines, quality_line
 from station.tui.daemon_link import DaemonApp
 from station.tui.frame import Line
 from station.tui.progress import LEGEND, progress_lines
@@ -22,11 +21,6 @@ from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 
 BACK = "Backspace takes the last view back"
-
-
-def _progress(known: Known, width: int, height: int) -> Content:
-    draw = hand_lines if known.shown.guidance.outline else progress_lines
-    return draw(known, width, height)
 
 
 class CaptureScreen(StationScreen):
@@ -43,7 +37,7 @@ class CaptureScreen(StationScreen):
                 yield PreviewPane(id="preview")
                 yield Line(lambda known, _: quality_line(known.shown.detection), id="quality")
             with Vertical(id="live-right"):
-                yield Panel("Poses", _progress, id="progress", below=LEGEND)
+                yield Panel("Poses", progress_lines, id="progress", below=LEGEND)
                 yield Panel(
                     "Predicted error",
                     error_lines,

@@ -234,15 +234,14 @@ ASKS: dict[str, type[Verb[Any]]] = {
 """Verb by the action of a key that asks the daemon for it."""
 NEEDS: dict[str, Callable[[Known], object]] = {
     "solve_newest": lambda known: known.shown.session.recording and not known.result,
-    "pose('retake')": lambda known: known.shown.session.poses,
-    "pose('skip')": lambda known: known.shown.session.poses,
-    "report": lambda known: known.result,
     "act('install')": lambda known: (
         known.result and not (known.result.installed and not known.result.state.withdrawn)
     ),
-    "act('touch test')": lambda known: known.result,
-    "act('undo')": lambda known: known.result and known.result.state.now,
-    "app.drift_check": lambda known: known.result and known.result.state.now,
+    **dict.fromkeys(
+        ("act('undo')", "app.drift_check"), lambda known: known.result and known.result.state.now
+    ),
+    **dict.fromkeys(("report", "act('touch test')"), lambda known: known.result),
+    **dict.fromkeys(("pose('retake')", "pose('skip')"), lambda known: known.shown.session.poses),
     **dict.fromkeys(("act('solve')", "act('check')", "act('recover')"), lambda known: known.sessions),
 }
 """What the action of a key works on; it has none while that is empty."""

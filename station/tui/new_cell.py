@@ -27,9 +27,8 @@ from station.cell.status import DetectionStatus
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
-from station.protocol.verbs import PreviewImage
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
-from station.tui.live_page import LivePage, LivePageApp, news
+from station.tui.live_page import LivePageApp, news
 from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
 from station.tui.task import Step
 from station.tui.widgets.preview import PreviewPane
@@ -101,7 +100,7 @@ class NewCell(LivePageApp[Ending]):
 
     def on_mount(self) -> None:
         self.watch_step()
-        self.set_interval(ARM_PERIOD_S, self.look_at_arm)
+        self.set_interval(ARM_PERIOD_S, self._show)  # what the arm tells
         self.look_at_camera()
         self.resume()
 
@@ -118,10 +117,6 @@ class NewCell(LivePageApp[Ending]):
             self.step = flow.next_step(self.setup.draft)
 
     # --- what the devices show ---
-
-    def look_at_arm(self) -> None:
-        if self.setup.arm is not None:
-            self._show()
 
     @work(group="camera", exit_on_error=False)
     async def look_at_camera(self) -> None:
@@ -169,17 +164,13 @@ class NewCell(LivePageApp[Ending]):
             pane.wanted = setup.guidance.outline if self.step is CellStep.VIEWS else ()
             pane.show(picture)
             if self.live_page is not None:
-                self._publish(self.live_page, picture)
+                seen = DetectionStatus() if setup.seen is None else setup.seen.status
+                action, views = next_of(setup, self.step, line.value.strip()), len(setup.draft.views)
+                self._news = news("New cell", action, seen, setup.guidance, views, picture)
+                self.live_page.publish(self._news)
         if taken:
             self._view_taken()
         self._show()
-
-    def _publish(self, page: LivePage, picture: PreviewImage) -> None:
-        setup, typed_now = self.setup, self.query_one("#typed", Input).value.strip()
-        seen = DetectionStatus() if setup.seen is None else setup.seen.status
-        action, views = next_of(setup, self.step, typed_now), len(setup.draft.views)
-        self._news = news("New cell", action, seen, setup.guidance, views, picture)
-        page.publish(self._news)
 
     def _view_taken(self) -> None:
         self.bell()

@@ -8,6 +8,7 @@ from textual.content import Content
 
 from station.cell.status import PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import RUNNING
+from station.tui.capture_panels import hand_lines
 from station.tui.task import Known
 from station.tui.words import Mark, dim, duration, facts, lines, mark
 
@@ -52,8 +53,10 @@ def pose_under_way(status: StationStatus) -> PoseStatus | None:
 
 
 def progress_lines(known: Known, width: int, height: int) -> Content:
-    """Draw how many poses are saved, the steps of the present one, and a chip for each."""
+    """Draw how many poses are saved, the steps of the present one, and a chip for each; by hand the guide."""
     status = known.shown
+    if status.guidance.outline:
+        return hand_lines(known, width, height)
     session, pose = status.session, pose_under_way(status)
     if not session.poses:
         return dim("no plan yet")

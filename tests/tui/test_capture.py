@@ -91,11 +91,11 @@ def test_the_error_falls_towards_its_goal() -> None:
     estimate = EstimateStatus(6, predicted_error_mm=0.83, working_distance_m=0.5)
     status = msgspec.structs.replace(in_session(idle(), poses=poses), estimate=estimate)
     lines = error_lines(Known(status, configuration=CELL), 60, 14).plain.split("\n")
-    assert all(said in lines[0] for said in ("0.83 mm", "500 mm", "goal 1 mm")) and "reached" not in lines[0]
+    assert all(said in lines[0] for said in ("0.83 mm", "500 mm", "goal 1 mm")) and "✓" not in lines[0]
     assert len(lines) == 14
     assert any(line.startswith(" 1.00 ") for line in lines)
     enough = msgspec.structs.replace(status, estimate=msgspec.structs.replace(estimate, enough=True))
-    assert "✓ reached" in error_lines(Known(enough, configuration=CELL), 60, 14).plain
+    assert "✓ goal 1 mm" in error_lines(Known(enough, configuration=CELL), 60, 14).plain
 
 
 def test_columns_stay_in_their_room_whatever_they_are_given() -> None:

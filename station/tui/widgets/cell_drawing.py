@@ -51,10 +51,6 @@ def cell_scene(config: StationConfig | None, status: StationStatus) -> CellLayou
     return replace(scene, X=np.array(estimate.camera_pose), Y=np.array(estimate.board_pose))
 
 
-def _board_corners(scene: CellLayout) -> Array:
-    return np.array([*product(*zip(*board_extent(scene.board), strict=True), (0.0,))])
-
-
 def draw(
     scene: CellLayout,
     status: StationStatus,
@@ -71,7 +67,7 @@ def draw(
     flange = {i: np.array(pose.base_from_flange) for i, pose in poses}
     joints = status.robot.joints_rad
     bodies = None if joints is None else body_segments(scene.geometry, np.array([joints]))
-    board = _board_corners(scene)
+    board = np.array([*product(*zip(*board_extent(scene.board), strict=True), (0.0,))])
     in_hand = scene.mount == "eye-in-hand"
     still = transform_points(scene.Y if in_hand else scene.X, board if in_hand else np.zeros((1, 3)))
     ground = [np.zeros((1, 3)), still, *(T[None, :3, 3] for T in flange.values())]

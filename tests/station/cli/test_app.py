@@ -23,8 +23,7 @@ from station.cell.pose_plan import plan_sha256
 from station.cell.status import MotionPreview
 from station.cli import main, session
 from station.cli.app import STATION
-from station.cli.daemon import tell_what_goes_on
-from station.cli.demo import simulated_daemon
+from station.cli.daemon import own_daemon, tell_what_goes_on
 from station.plan.files import load_plan
 from station.protocol.states import RUNNING
 from tests.command_line import call
@@ -61,7 +60,8 @@ class Shell:
 @pytest.fixture
 def shell(tmp_path: Path) -> Iterator[Shell]:
     """Beside a simulated daemon, faster than real time."""
-    with simulated_daemon(tmp_path, ["--time-scale", "4"]) as socket:
+    served = ["--simulate", "--root", str(tmp_path), "--time-scale", "4"]
+    with own_daemon(served, tmp_path / "daemon.log") as socket:
         yield Shell(socket)
 
 

@@ -233,16 +233,12 @@ ASKS: dict[str, type[Verb[Any]]] = {
 }
 """Verb by the action of a key that asks the daemon for it."""
 NEEDS: dict[str, Callable[[Known], object]] = {
-    "solve_newest": lambda known: known.shown.session.recording and not known.result,
-    "act('install')": lambda known: (
-        known.result and not (known.result.installed and not known.result.state.withdrawn)
-    ),
-    **dict.fromkeys(
-        ("act('undo')", "app.drift_check"), lambda known: known.result and known.result.state.now
-    ),
-    **dict.fromkeys(("report", "act('touch test')"), lambda known: known.result),
-    **dict.fromkeys(("pose('retake')", "pose('skip')"), lambda known: known.shown.session.poses),
-    **dict.fromkeys(("act('solve')", "act('check')", "act('recover')"), lambda known: known.sessions),
+    "solve_newest": lambda now: now.shown.session.recording and not now.result,
+    "act('install')": lambda now: now.result and (now.result.state.withdrawn or not now.result.installed),
+    **dict.fromkeys(("act('undo')", "app.drift_check"), lambda now: now.result and now.result.state.now),
+    **dict.fromkeys(("report", "act('touch test')"), lambda now: now.result),
+    **dict.fromkeys(("pose('retake')", "pose('skip')"), lambda now: now.shown.session.poses),
+    **dict.fromkeys(("act('solve')", "act('check')", "act('recover')"), lambda now: now.sessions),
 }
 """What the action of a key works on; it has none while that is empty."""
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]

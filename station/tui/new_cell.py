@@ -234,9 +234,8 @@ class NewCell(LivePageApp[Ending]):
         if step is CellStep.ROBOT:
             self._say("#live-lines", "Asking the controller …")
         with self._problems():
-            text, look_first = self.query_one("#typed", Input).value.strip(), False
-            if chosen is not None:
-                look_first = await self.setup.open(chosen)
+            text = self.query_one("#typed", Input).value.strip()
+            look_first = chosen is not None and await self.setup.open(chosen)
             if look_first or not await accept(self.setup, step, text):
                 self.watch_step()
             elif step is CellStep.SAVE:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import subprocess
 import sys
 import tempfile
@@ -13,7 +12,8 @@ from pathlib import Path
 from socket import AF_UNIX
 from socket import socket as connection
 
-from recordings.files import LOG_LIMIT_BYTES, open_regular, read_file, state_root
+from recordings.files import state_root
+from station.cell.child import ChildProcess, start_child
 from station.cell.errors import StationError
 from station.cell.socket_folder import default_socket, way_to_end
 from station.cli.console import Socket
@@ -64,40 +64,22 @@ def own_daemon(arguments: Sequence[str], log: Path) -> Iterator[Path]:
     """
     with tempfile.TemporaryDirectory(prefix="station-") as place:
         socket = Path(place) / "control.sock"
-        child = _started([*arguments, "--socket", str(socket), "--end-with-stdin"], log, subprocess.PIPE)
-        assert child.stdin is not None
+        child = ChildProcess(
+            _started([*arguments, "--socket", str(socket), "--end-with-stdin"], log, subprocess.PIPE)
+        )
         try:
             yield socket
         finally:
-            child.stdin.close()
-            try:
-                child.wait(END_S)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
+            child.stop(END_S)
 
 
 def _started(arguments: Sequence[str], log: Path, stdin: int) -> subprocess.Popen[bytes]:
-    """A daemon that serves, in a session of its own: Ctrl-C in this terminal is not meant for it.
-
-    Raises StationError with the end of its log.
-    """
-    with os.fdopen(open_regular(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab") as words:
-        child = subprocess.Popen(
-            [sys.executable, "-m", "station.cli", "serve", *arguments],
-            stdin=stdin,
-            stdout=subprocess.PIPE,
-            stderr=words,
-            start_new_session=True,
-        )
-    assert child.stdout is not None
-    with child.stdout as told:
-        if select.select([told], [], [], READY_S)[0] and told.readline():
-            return child
-    child.kill()
-    child.wait()
-    tail = "\n".join(read_file(log, LOG_LIMIT_BYTES).decode(errors="replace").splitlines()[-3:])
-    raise StationError("not-started", log=log, tail=tail)
+    """Start a daemon and wait until it serves. StationError with the end of what it said."""
+    command = [sys.executable, "-m", "station.cli", "serve", *arguments]
+    child, problem = start_child(command, READY_S, log, stdin)
+    if problem:
+        raise StationError("not-started", log=log, tail="\n".join(problem.splitlines()[-3:]))
+    return child
 
 
 def tell_what_goes_on(socket: Path) -> None:

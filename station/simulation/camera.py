@@ -14,12 +14,12 @@ import msgspec
 
 from calibrate.geometry import Array
 from recordings.schema.messages import CameraIdentity, ClockReading, Image
+from station.cell.child import ChildProcess
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import DeviceThread
 from station.devices.frames import FrameClock, FrameCounter
-from station.simulation.launch import ChildProcess
 from station.simulation.truth import CellTruth
 
 START_TIMEOUT_S = 20.0

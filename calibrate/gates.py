@@ -94,7 +94,7 @@ _RULES = {
     "view_rms_px": _Rule("Largest rms error of a view", "≤", "px"),
     "holdout_share": _Rule("Held-out error", "≤", "share", "Check robot accuracy and corner detection."),
     "cross_validation": _Rule(
-        "Cross-validated error over what chance explains",
+        "Cross-validated error",
         "≤",
         "",
         "Check intrinsics, board and looseness of the mounts.",
@@ -103,13 +103,13 @@ _RULES = {
     "coverage": _Rule("Image coverage", "≥", "share", "Bring the board into the corners of the image."),
     "clock_bound_s": _Rule("Time sync", "≤", "s", "Check the camera's clock, or use a hardware trigger."),
     "lens_pull": _Rule(
-        "Unexplained shift by the fixed intrinsics over the error of X",
+        "Shift by fixed intrinsics",
         "≤",
         "",
         "Solve with --estimate-intrinsics, or calibrate the camera again.",
     ),
     "board_pull": _Rule(
-        "Unexplained shift by the stated board over the error of X",
+        "Shift by the stated board",
         "≤",
         "",
         "Measure the squares both ways and the flatness, correct square_m and solve again.",
@@ -138,7 +138,7 @@ def _measured(
         missed_m = solution.holdout.e_t_m
         yield "holdout_share", missed_m / distance_m, f"({1e3 * missed_m:.2g} mm)", ""
     if folds is not None:
-        figures = f"({folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm)"
+        figures = f"({folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm; 1 is what chance explains)"
         yield "cross_validation", folds.rms_mm / folds.claimed_mm / folds.limit, figures, ""
     remedy = f"Least known: {seen.weakest_text}. Add rotations about that direction."
     yield "predicted_error_m", predicted_m, f"at {(distance_m or 0.0) * 1e3:.0f} mm", remedy
@@ -146,7 +146,8 @@ def _measured(
     yield "clock_bound_s", clock_bound_s, "", ""
     for name, finding in (("lens_pull", solution.lens_finding), ("board_pull", solution.board_finding)):
         if finding is not None:
-            figures = f"({finding.unexplained_m * 1e3:.2f} of {finding.pull_m * 1e3:.2f} mm)"
+            of_mm = f"{finding.unexplained_m * 1e3:.2f} of {finding.pull_m * 1e3:.2f} mm"
+            figures = f"({of_mm} unexplained; 1 is the error of X)"
             yield name, finding.unexplained_m / finding.error_m, figures, ""
     if noise is not None:
         yield "robot_error_m", noise.robot_m, "", ""

@@ -188,7 +188,8 @@ class NewCell(LivePageApp[Ending]):
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         rehearsed = action == "rehearse" and self.setup.draft.posted
-        return ONLY_IN.get(action, self.step) is self.step and not rehearsed
+        nowhere = self.step is STEPS[0] and parameters == (-1,)
+        return ONLY_IN.get(action, self.step) is self.step and not rehearsed and not nowhere
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
@@ -203,7 +204,7 @@ class NewCell(LivePageApp[Ending]):
             self.notify(words, severity="error", markup=False)
             return
         self.notify(
-            "The controller stopped its program. If the arm moves, press the EMERGENCY STOP.",
+            "The controller confirmed STOP. If the arm moves, press the EMERGENCY STOP.",
             severity="warning",
         )
 

@@ -65,10 +65,10 @@ class Canvas:
         self.points(dots[near], rank)
 
     def text(self, at: Points, words: str, rank: int) -> None:
-        """Write words; their first letter is the one with the dot `at` (2,)."""
+        """Write words; their first letter is the one with the dot `at` (2,), or next to it where they fit."""
         if np.isfinite(at).all():
             column, row = (at // PER_LETTER).astype(int).tolist()
-            self._texts.append((column, row, words, rank))
+            self._texts.append((max(0, min(column, self.columns - len(words))), row, words, rank))
 
     def content(self, styles: Sequence[str]) -> Content:
         """Return the drawing; `styles` of the ranks, from rank 1 on."""

@@ -75,22 +75,25 @@ class CornerModes:
         return float(((self._whitening[0] @ right[..., None]) ** 2).sum())
 
     @cached_property
-    def _plain(self) -> float:
-        """Estimate σ², px²: corner noise that no board pose, lens or shape explains."""
-        rest = max(float(self.left.sum()) - self._own_decrease(self.free.right), 0.0)
+    def _rest(self) -> tuple[float, float]:
+        """Squares (px²) that no board pose, lens or shape explains, and their number: 0 of a single tag."""
+        rest = float(self.left.sum()) - self._own_decrease(self.free.right)
         freedom = float(self.rows.sum()) - 6 * len(self.rows) - self._whitening[1]
-        return max(rest / max(freedom, 1.0), 1e-8)
+        return max(rest, 0.0), max(freedom, 0.0)
 
     def variances(self, lambda_px: float, covariance: Array, step: Array) -> tuple[float, float]:
         """Estimate σ² and λ² (px²) after a step (G,) with this covariance (G, G).
 
         λ² are the squares that each view alone could still win by a lens and shape of its own, over the
-        number of these modes less those that the common lens and shape used up.
+        number of these modes less those that the common lens and shape used up. σ has a prior about λ, as λ
+        about σ: views of a single tag tell no more of σ.
         """
+        rest, freedom = self._rest
+        sigma2 = max((rest + MODE_COUNT * lambda_px**2) / (freedom + MODE_COUNT), 1e-8)
         after = self.free.right - self.free.information @ step[self.shared]
         part = covariance[self.shared, self.shared]
         used = float(np.einsum("ij,ji", part, self.information)) / lambda_px**2
-        sigma2, rank = self._plain, self._whitening[1]
+        rank = self._whitening[1]
         lambda2 = (self._own_decrease(after) + MODE_COUNT * sigma2) / max(rank - used + MODE_COUNT, 1.0)
         return sigma2, max(lambda2, sigma2)
 

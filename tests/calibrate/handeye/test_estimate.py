@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import difference
+from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.noise_scales import MeasurementNoise
-from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.solve import solve_views
 from calibrate.projection import intrinsics_vector
 from tests.calibrate.cells import (
@@ -25,6 +26,7 @@ from tests.calibrate.cells import (
     real_cell,
     sigmas_of,
 )
+from tests.calibrate.chains import arm_cell
 
 SAME = replace(QUICK, intrinsics_from_same_pictures=True)
 
@@ -157,3 +159,13 @@ def test_every_seed_ends_in_the_same_camera():
     views = make_cell(np.random.default_rng(6), 15, LOW).views
     first, second = (solve_views(views, replace(QUICK, seed=seed)) for seed in range(2))
     np.testing.assert_allclose(second.matrix, first.matrix, atol=1e-6)
+
+
+@MOUNTS
+def test_four_corners_of_a_tag_are_noisy_though_little_tells_it(mount):
+    """Pose and lens explain nearly all of them. That must not take most corners' weight."""
+    views, tag = arm_cell("ur", mount, 0.0, 3, views=20).views, [0, 8, 54, 62]
+    few = {"pixels": lambda view: view.pixels[tag], "board_points": lambda view: view.board_points[tag]}
+    four = changed(views, list(range(20)), **few)
+    fit = fit_cell(four, Priors(LensPrior.unknown(four.camera)), 0).plain
+    assert 0.05 < fit.scales.sigma_px <= fit.scales.tau_px < 0.5 and fit.corner_weights.min() > 0.1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import difference
-from calibrate.handeye.fit import fit_cell
+from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.solve import solve_views

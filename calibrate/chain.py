@@ -199,7 +199,7 @@ _QUICK = 1
 """Starts of a trial that is expected to fail: where joints fit, nearly every start explains them."""
 
 
-def readings(joints_rad: Array) -> Iterator[tuple[Array, str]]:
+def joint_readings(joints_rad: Array) -> Iterator[tuple[Array, str]]:
     """Yield joints as they stand, then read otherwise, and what was done.
 
     Degrees, two columns exchanged, a joint that also turns with the one before it.
@@ -220,7 +220,7 @@ def readings(joints_rad: Array) -> Iterator[tuple[Array, str]]:
 
 def read_otherwise(joints_rad: Array, flanges: Array) -> tuple[Array, str] | None:
     """Find the reading of joints that do not explain the flanges: the joints so read, and what was done."""
-    for joints, done in readings(joints_rad):
+    for joints, done in joint_readings(joints_rad):
         if done and learn_chain(joints, flanges, _QUICK).explains:
             return joints, done
     return None

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibrate.chain import Chain, LearnedChain, readings
+from calibrate.chain import Chain, LearnedChain, joint_readings
 from calibrate.geometry import Array, difference
 from calibrate.handeye.arm import (
     flange_extent,
@@ -147,7 +147,7 @@ class KnownCell:
         joints, flanges = recorded_joints(views), views.base_from_flange
         if self.chain is None or joints is None or joints.shape[1] != len(self.chain.axes):
             return None
-        for read, _ in readings(joints):
+        for read, _ in joint_readings(joints):
             if LearnedChain(self.chain, difference(self.chain.forward(read), flanges)).explains:
                 return read
         return None

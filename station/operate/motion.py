@@ -1,4 +1,7 @@
-"""Motion that a person approves: check the path, show it, start it, watch until the arm rests."""
+"""Motion that a person approves, as a client asks for it: check, show, start, watch until the arm rests.
+
+What the daemon offers and what it refuses: `session.motion`.
+"""
 
 from __future__ import annotations
 

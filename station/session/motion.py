@@ -1,4 +1,7 @@
-"""Motion that a person may approve: its poses, a preview from where the arm is, and the one-use approval."""
+"""Motion that a person may approve: its poses, a preview from where the arm is, and the one-use approval.
+
+The daemon's side; how a client asks for a motion and shows it to a person: `operate.motion`.
+"""
 
 from __future__ import annotations
 

@@ -21,7 +21,10 @@ from numpy.typing import NDArray
 
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array
+from calibrate.errors import BadViewsError
+from calibrate.geometry import Array, transform_points
+from calibrate.lens.pnp import planar_tilts
+from calibrate.views import BoardView
 from recordings.images import Pixels, eight_bits, viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Vector6
 from station.cell.config import StationConfig
@@ -133,16 +136,12 @@ def _distance_and_tilt(
     pixels: Array, points: Array, camera: CameraModel
 ) -> tuple[float | None, float | None]:
     """Compute distance (m) to the board's centre, and angle (rad) of its normal to the optical axis."""
-    K = np.array(camera.matrix)
-    ok, rotation, translation = cv2.solvePnP(
-        points, pixels, K, np.array(camera.distortion or (0.0,) * 5), flags=cv2.SOLVEPNP_IPPE
-    )
-    if not ok:
+    try:
+        C = planar_tilts(BoardView(0, "", np.eye(4), points, pixels), camera)[0]
+    except BadViewsError:
         return None, None
-    R = cv2.Rodrigues(rotation)[0]
-    centre = R @ points.mean(axis=0) + translation.ravel()
-    tilt = float(np.arccos(np.clip(abs(R[2, 2]), 0.0, 1.0)))
-    return round(float(np.linalg.norm(centre)), 4), round(tilt, 4)
+    tilt = float(np.arccos(np.clip(abs(C[2, 2]), 0.0, 1.0)))
+    return round(float(np.linalg.norm(transform_points(C, points.mean(axis=0)))), 4), round(tilt, 4)
 
 
 def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> PlanCheck:

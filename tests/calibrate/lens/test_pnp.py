@@ -8,14 +8,7 @@ from hypothesis import strategies as st
 
 from benchmarks.scene import random_rotation
 from calibrate.boards.model import board_from_turned, board_points
-from calibrate.geometry import (
-    Array,
-    inverse,
-    perturb,
-    pose,
-    rotation_angle,
-    transform_points,
-)
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_angle, transform_points
 from calibrate.lens.pnp import candidate_poses, choose_candidates, solve_pnp
 from calibrate.projection import project_pixels
 from calibrate.views import BoardView, ViewSet

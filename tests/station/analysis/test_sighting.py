@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 import recordings
+from calibrate.boards.detect import Detection
+from calibrate.boards.model import board_points
+from calibrate.geometry import transform_points
+from calibrate.projection import project_pixels
 from recordings.reader import open_recording
+from recordings.schema.messages import CameraModel
+from station.analysis import worker
 from station.analysis.estimation import seen_before
 from station.analysis.worker import sight
 from station.cell.config import PAPER_BOARD
@@ -33,6 +39,19 @@ def test_the_distance_is_the_same_in_a_preview_of_half_the_size(factor: float) -
     picture = render(scaled(camera, factor), PAPER_BOARD, view, Light(), np.random.default_rng(0))
     status = sight(picture, PAPER_BOARD, camera, False).status
     assert status.distance_m == pytest.approx(0.5, abs=0.005)
+
+
+def test_distance_and_tilt_are_those_by_a_fisheye_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = CameraModel(
+        640, 512, ((250.0, 0, 320), (0, 250.0, 256), (0, 0, 1)), (0.2, -0.1, 0.0, 0.0), "equidistant"
+    )
+    points, C = board_points(PAPER_BOARD), seen_from(PAPER_BOARD, 0.2)
+    pixels = project_pixels(lens, transform_points(C, points))
+    seen = Detection("", "", np.arange(len(points)), pixels, len(points), 640, 512, 0.0, 0.0, 0.5)
+    monkeypatch.setattr(worker, "detect", lambda *_: seen)
+    status = sight(np.zeros((512, 640), np.uint8), PAPER_BOARD, lens, False).status
+    assert status.distance_m == pytest.approx(0.2, abs=1e-4)
+    assert status.tilt_rad == pytest.approx(float(np.arccos(C[2, 2])), abs=1e-3)
 
 
 def test_the_pictures_of_a_recording_are_seen_again_with_their_poses() -> None:

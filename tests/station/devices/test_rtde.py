@@ -8,13 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.devices.rtde import (
-    DATA_TYPES,
-    PacketReader,
-    PacketType,
-    Recipe,
-    packet,
-)
+from station.devices.rtde import DATA_TYPES, PacketReader, PacketType, Recipe, packet
 from tests.codes import raises
 
 MOVE = Recipe(

@@ -105,7 +105,8 @@ class FrameNames:
         return np.asarray(parent_from_camera @ inverse(self._between(self.attach, lens)))
 
     def _between(self, parent: str, child: str) -> Array:
-        return np.asarray(self.fixed.track(parent, child).at(np.zeros(1, np.int64))[0])
+        last_ns = np.array([np.iinfo(np.int64).max])
+        return np.asarray(self.fixed.track(parent, child).at(last_ns)[0])
 
 
 def comment(calibration: Calibration, frames: FrameNames, corrected: bool = False) -> str:

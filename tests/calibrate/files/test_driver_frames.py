@@ -17,10 +17,12 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.exports import FrameNames, export
 from calibrate.files.exports.drivers import fixed_frames
 from calibrate.geometry import Array, pose
+from recordings.importers.frames import FrameTree
 from recordings.schema.messages import RobotIdentity
 from tests.calibrate.files.test_exports import calibration as calibration
 from tests.codes import raises
 from tests.foreign.bags import RosMessages
+from tests.recordings.test_bag_frames import frame, turned
 
 OPTICAL = (-np.pi / 2, 0, -np.pi / 2)
 Frames = dict[str, tuple[str, tuple[float, ...], tuple[float, ...]]]
@@ -45,6 +47,13 @@ DRIVERS: dict[str, tuple[str, str, Frames]] = {
 
 def matrix(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Array:
     return pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
+
+
+def test_the_last_word_of_a_driver_counts() -> None:
+    tree = FrameTree()
+    tree.add([frame(t, "camera_link", "lens", turned(0.1 * t)) for t in (1, 2, 3)])
+    placed = FrameNames(attach="camera_link", camera="lens", fixed=tree).attached("tool0", np.eye(4))
+    np.testing.assert_allclose(placed, turned(-0.3), atol=1e-12)
 
 
 def as_urdf(frames: Frames) -> str:

@@ -59,9 +59,8 @@ def test_the_frames_of_a_ur_are_its_controllers(wanted: Wanted | None) -> None:
     np.testing.assert_allclose(T, turned(0.03 - np.pi), atol=1e-12)
 
 
-@pytest.mark.parametrize("image", ["/cam/image_rect", "/cam/image_rect_color/compressed"])
-def test_rectified_images_have_the_lens_without_distortion(image: str) -> None:
-    camera = chosen(image, __cam__camera_info=[calibration()]).camera
+def test_rectified_images_have_the_lens_without_distortion() -> None:
+    camera = chosen("/cam/image_rect_color/compressed", __cam__camera_info=[calibration()]).camera
     assert camera is not None and camera.matrix is not None
     assert (camera.matrix[0], camera.distortion) == ((800, 0, 14), ())
 
@@ -71,7 +70,6 @@ def test_a_lens_is_taken_from_the_images_own_namespace() -> None:
     left = chosen("/rig/left/image_direct", **both).camera
     assert left is not None and left.matrix is not None and left.matrix[0][0] == 700
     assert chosen("/rig/right/image_raw", **both).camera is None
-    assert chosen("/image_raw", __camera_info=[calibration()]).camera is not None
 
 
 def test_a_lens_of_another_model_is_not_known() -> None:
@@ -90,5 +88,4 @@ def test_joints_come_by_their_numbers_and_what_is_no_number_is_passed_over() -> 
     np.testing.assert_array_equal(track.positions_rad, [[1, 2, 3, 4, 5, 6]])
     assert track.speeds_rad_s is None
     assert chosen(__joints=joints(names, (), nothing)).joints is None
-    unnumbered = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
-    assert chosen(__joints=joints(unnumbered, (1, 2, 3, 4, 5))).joints is None, "nothing says their order"
+    assert chosen(__joints=joints(tuple("abcde"), (1, 2, 3, 4, 5))).joints is None, "in which order?"

@@ -8,6 +8,7 @@ from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 
+from calibrate.check.history import FILE as CHECKS_FILE
 from calibrate.check.history import CheckEntry, read_checks
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, Verdict, read_calibration
@@ -120,7 +121,7 @@ def marks(root: Path) -> Marks:
     found = set[tuple[str, int]]()
     for path in (
         *(root / "sessions").glob("*"),
-        *(f / n for f in folders for n in ("current", VALIDITY_FILE)),
+        *(f / n for f in folders for n in ("current", VALIDITY_FILE, CHECKS_FILE)),
     ):
         with suppress(OSError):
             found.add((str(path), path.lstat().st_mtime_ns))

@@ -9,12 +9,14 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import DataTable
 
+from calibrate.check.history import CheckEntry, append_check
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
 from station.tui import app as app_module
 from station.tui.app import StationApp
 from station.tui.installed import read_installed
+from station.tui.task import next_action
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, text_of, until
 from tests.tui.test_install import GOOD, OFF
 
@@ -101,6 +103,18 @@ def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
     assert read_installed(root).word("s-1") == "INSTALLED, in doubt"
     put(root, "s-2")
     assert {c.provenance.session for c in read_installed(root).earlier} == {"s-1"}
+
+
+async def test_after_a_drift_check_the_result_is_what_it_judged(link: FakeLink, root: Path) -> None:
+    put(root, "s-1")
+    app, folder = app_on(link), root / "sessions" / "s-2"
+    (folder / "calibration.yaml").unlink()
+    link.show(in_session(idle(), name="s-2", check=True, folder=str(folder), recording="session.mcap"))
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: app.known.result and app.known.sessions)
+        assert next_action(app.known).key == "k"
+        append_check(CheckEntry(0.0, 1, "s-2", True, (0.0,) * 6, 1.0, 12.6), root)
+        await until(pilot, lambda: next_action(app.known).key == "d")
 
 
 async def test_the_result_of_the_session_just_captured_needs_no_picking(link: FakeLink, root: Path) -> None:

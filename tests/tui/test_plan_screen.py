@@ -7,12 +7,9 @@ import asyncio
 import msgspec
 from textual.widgets import DataTable
 
-from station.cell.status import PoseStatus
 from station.protocol import verbs
 from station.tui.daemon_link import busy_words
-from station.tui.plan_screen import facts_line
-from station.tui.task import Known
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
+from tests.tui.conftest import FakeLink, idle, in_session, opened, said, text_of, until
 
 
 class SlowPlanner(FakeLink):
@@ -49,18 +46,6 @@ async def test_run_makes_the_plan_that_is_not_there_and_asks(link: FakeLink) -> 
         assert link.verbs == ["make_plan", "prepare"]
 
 
-async def test_the_end_of_two_hundred_poses_is_told_as_the_start_is(link: FakeLink) -> None:
-    poses = tuple(PoseStatus(index=i, name=f"p{i + 1:03d}", why=f"place {i + 1}") for i in range(200))
-    link.show(in_session(idle(), poses=poses))
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "/200" in text_of(pilot.app, "#rail"))
-        await pilot.press("2", "end")
-        table = pilot.app.screen.query_one(DataTable)
-        await until(pilot, lambda: table.cursor_row == 199)
-        link.show(in_session(idle(), poses=poses[:-1]))
-        await until(pilot, lambda: table.cursor_row == 198)
-
-
 async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> None:
     status = idle()
     async with opened(link) as pilot:
@@ -73,11 +58,3 @@ async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> No
             pilot, lambda: table.row_count == 25 and str(table.get_row_at(7)[-2]) == "failed: too dark"
         )
         assert [str(table.get_row_at(row)[0])[-1] for row in (6, 7)] == ["○", "✗"]  # never cut away
-
-
-def test_the_error_at_the_end_is_that_of_the_last_pose_alone() -> None:
-    poses = [PoseStatus(index=i, name=f"p{i}", predicted_sigma_mm=0.2 + i) for i in range(3)]
-    for last_known, shown in ((True, True), (False, False)):
-        poses[-1] = msgspec.structs.replace(poses[-1], predicted_sigma_mm=2.2 if last_known else None)
-        changed = in_session(idle(), poses=tuple(poses))
-        assert ("±" in facts_line(Known(changed)).plain) is shown

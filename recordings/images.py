@@ -221,6 +221,8 @@ def raw_array(data: bytes, encoding: str, width: int, height: int, step: int = 0
     step, data = (step, data[: step * height]) if step else (row, data)  # drivers may leave more in a buffer
     if step < row or len(data) != step * height or not height:
         raise ImageError(f"holds {len(data)} bytes where {width}×{height} {encoding} needs {step * height}")
+    if channels == 2 and width % 2:
+        raise ImageError(f"is {width} px wide, and two pixels of {encoding} share their colour")
     pixels = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(height, step)[:, :row]).view(kind)
     if channels > 1:
         pixels = pixels.reshape(height, width, channels)

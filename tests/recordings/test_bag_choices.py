@@ -15,8 +15,6 @@ from recordings.importers.messages import FrameMessage, ImageMessage, JointMessa
 from recordings.importers.selection import Selection, Wanted, select
 from tests.recordings.test_bag_frames import frame, random_pose, turned
 
-STEPS = 20
-
 
 def ur_frames() -> list[list[FrameMessage]]:
     """As ROS 2's ur_description has them, and a controller's frame with a tool."""
@@ -25,8 +23,8 @@ def ur_frames() -> list[list[FrameMessage]]:
         frame(0, "wrist_3_link", "flange", turned(1.0)),
         frame(0, "flange", "tool0", turned(-1.0)),
     ]
-    tools = [frame(n, "base", "tool0_controller", random_pose(n)) for n in range(STEPS)]
-    return [fixed, tools, [frame(n, "base_link", "wrist_3_link", turned(0.01 * n)) for n in range(STEPS)]]
+    tools = [frame(n, "base", "tool0_controller", random_pose(n)) for n in range(9)]
+    return [fixed, tools, [frame(n, "base_link", "wrist_3_link", turned(0.01 * n)) for n in range(9)]]
 
 
 def calibration(

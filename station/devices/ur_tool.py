@@ -179,7 +179,7 @@ class TcpCheck:
         self._model = model
         self._tolerance = CALIBRATED_TOLERANCE if calibrated else NOMINAL_TOLERANCE
         self._source: Literal["controller", "configuration"] | None = "configuration" if calibrated else None
-        self._stated = installation.tcp_offset
+        self._stated = self._told = installation.tcp_offset
         if not calibrated and installation.dh is not None and self._stated is not None:
             theta, a, d, alpha = installation.dh
             stated = replace(model, theta_rad=theta, a_m=a, d_m=d, alpha_rad=alpha)
@@ -233,8 +233,9 @@ class TcpCheck:
         In motion the tolerance of the tool pose is larger, that of the stated offset is not.
         """
         offset = installation.tcp_offset
-        if self._stated is not None and offset is not None and offset != self._stated:
-            _compare(_pose(offset), _pose(self._stated), STATED_TOLERANCE, "tcp-changed", self._model.name)
+        self._told = self._told or offset  # the first statement may come late
+        if self._told is not None and offset is not None and offset != self._told:
+            _compare(_pose(offset), _pose(self._told), STATED_TOLERANCE, "tcp-changed", self._model.name)
         now = _flange_from_tcp(self._model, state)
         turned_rad = SKEW_S * sum(map(abs, state.joint_speeds_rad_s))
         reach_m = float(np.linalg.norm(state.tcp_pose[:3])) + LONGEST_M

@@ -64,7 +64,8 @@ class Session:
         )
         monitor = StillnessMonitor(config.stillness)
         self.context = SessionContext(cell, self.store, Workers(start_worker, warm_up), monitor, root)
-        self.approvals = ApprovalManager(time.monotonic)
+        # This clock goes on while the computer sleeps: no offer outlives that.
+        self.approvals = ApprovalManager(lambda: time.clock_gettime(time.CLOCK_BOOTTIME))
         self.supervisor = SessionSupervisor(self.context, self._void)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)

@@ -136,6 +136,13 @@ def test_a_changed_statement_is_noticed_before_the_arm_shows_it() -> None:
         check.check(sample(UR10, HERE, TOOL), stated(UR10, (*TOOL[:5], 0.5001)))
 
 
+def test_a_first_statement_that_comes_late_binds_all_later_ones() -> None:
+    check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation())
+    check.check(sample(UR10, HERE, TOOL), stated(UR10, TOOL))
+    with raises("tcp-changed"):
+        check.check(sample(UR10, HERE, TOOL), stated(UR10, (*TOOL[:2], 0.155, *TOOL[3:])))
+
+
 def state_of(made: SimulatedRobot) -> bytes:
     """The payload of its first robot state message."""
     return state(made, first=True)[5:]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 from recordings.recorder import Recorder
 from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
-from station.cell.status import LeaseStatus
+from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Skip
 from station.server.connections import ClientServer
@@ -49,6 +50,14 @@ async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: 
     rig.session.store.watch(fails)
     await rig.session.stop("bert")
     assert rig.state is S.STOPPED and "stop" in rig.arm.log
+
+
+async def test_an_offer_does_not_outlive_the_sleep_of_its_computer(rig: Rig, monkeypatch: Any) -> None:
+    token, clock = (await rig.session.prepare(1, Purpose.RUN)).token, time.clock_gettime
+    slept_s = {time.CLOCK_BOOTTIME: APPROVAL_LIFETIME_S}
+    monkeypatch.setattr(time, "clock_gettime", lambda number: clock(number) + slept_s.get(number, 0.0))
+    with raises("approval-expired"):
+        await rig.session.go(1, token)
 
 
 @pytest.mark.parametrize("state", [S.STOPPED, S.FAULT])

@@ -55,6 +55,12 @@ class Installed:
         return f"INSTALLED, {self.validity.state.replace('-', ' ')}"
 
     @property
+    def doubted(self) -> bool:
+        """`now` is in doubt, or withdrawn."""
+        doubts = ValidityState.IN_DOUBT, ValidityState.WITHDRAWN
+        return self.validity is not None and self.validity.state in doubts
+
+    @property
     def withdrawn(self) -> bool:
         """A person took `now` out of use."""
         return self.validity is not None and self.validity.state is ValidityState.WITHDRAWN

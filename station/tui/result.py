@@ -209,7 +209,8 @@ class ResultScreen(StationScreen):
             return
         self._drawn = result
         verdict = self.query_one("#verdict", Static)
-        verdict.set_classes("" if result is None else SHOWN[result.verdict][1])
+        doubted = result is not None and result.installed and result.state.doubted
+        verdict.set_classes("" if result is None else "-reason" if doubted else SHOWN[result.verdict][1])
         verdict.update(Content(NO_RESULT) if result is None else verdict_lines(result))
         calibration = None if result is None else result.calibration
         self.query_one("#result").display = calibration is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from calibrate.files.validity import ValidityState
+from calibrate.files.validity import validity_text
 from station.cell.config import StationConfig
 from station.cell.status import NO_IMAGE, DetectionStatus, GuidanceStatus, StationState, StationStatus
 from station.operate.next_step import StepKind, after_solve
@@ -176,7 +176,7 @@ def _result(known: Known) -> Step:
     if calibration is None:
         return Step("result", "failed", "unreadable")
     if result.installed:
-        return Step("result", "look" if result.state.withdrawn else "done", result.state.held.lower())
+        return Step("result", "look" if result.state.doubted else "done", result.state.held.lower())
     gates, failed = calibration.quality.gates, calibration.quality.failed
     return Step(
         "result", "failed" if failed else "todo", f"{len(gates) - len(failed)} of {len(gates)} gates passed"
@@ -283,12 +283,8 @@ def _with_result(result: Result, status: StationStatus) -> Action:
     if calibration is None:
         return Action("5", "Choose a session", result.problem, look=True)
     step = after_solve(calibration, () if result.installed else result.objections)
-    if result.state.withdrawn and result.installed:
-        why = "Withdrawn: programs are refused this one. i on 4 installs it again."
-        return Action("n", "Plan 25 poses", why, at="plan", look=True)
-    validity = result.state.validity
-    if result.installed and validity is not None and validity.state is ValidityState.IN_DOUBT:
-        return Action("n", "Plan 25 poses", f"In doubt: {validity.reason.text}", at="plan", look=True)
+    if result.installed and (validity := result.state.validity) is not None and result.state.doubted:
+        return Action("n", "Plan 25 poses", sentence(validity_text(validity)), at="plan", look=True)
     if result.installed:
         return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="result")
     if step.kind is StepKind.INSTALL:

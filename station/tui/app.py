@@ -74,9 +74,7 @@ class StationApp(LivePageApp[None], DaemonApp):
         Binding("f5", "run", "Run", tooltip="Plan if there is no plan, show the motion, and ask"),
         Binding("f6", "ask('pause')", "Pause", tooltip="Stop after this pose"),
         Binding("f7", "finish", "Finish", tooltip="Finish with the poses so far"),
-        Binding(
-            "f8", "acknowledge", "Acknowledge", priority=True, tooltip="Leave STOPPED or FAULT after looking"
-        ),
+        Binding("f8", "acknowledge", "Acknowledge", priority=True, tooltip="Look; then leave STOPPED, FAULT"),
         Binding("f9", "solve_newest", "Solve", tooltip="Solve the session just recorded"),
         Binding("f3", "freedrive", "Freedrive", tooltip="Freedrive: move the arm by hand"),
         Binding("f2", "ask('record')", "Image", tooltip="Capture an image here (freedrive)"),

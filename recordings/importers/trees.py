@@ -1,0 +1,110 @@
+"""Data files of any form as plain trees: dicts, lists, numbers, texts."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+from scipy.io import loadmat
+
+from recordings import strict_yaml
+from recordings.files import read_file
+
+_BYTES_LIMIT, _ARRAY_LIMIT_BYTES = 4 * 1024 * 1024, 128 * 1024
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
+_YAML = (".yaml", ".yml", ".samples", ".calib")
+_SUFFIXES = (*_YAML, ".json", ".xml", ".csv", ".txt", ".dat", ".tsv", ".script")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
+IMAGE = re.compile(rf"[^\s,;'\"\[\]]+(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))})\b", re.I)
+"""A name of an image."""
+POSE_SIZES = (6, 7, 12, 16, 8, 13, 17)
+"""Numbers of a pose; the last three with a time stamp or a running number before them."""
+
+
+def read_tree(path: Path) -> Any:
+    """A data file as dicts, lists, numbers and texts; None: no such file, or not readable as what it says."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix in (".npy", ".npz", ".mat"):
+            array = BytesIO(read_file(path, _ARRAY_LIMIT_BYTES))  # larger: an image of depths
+            loaded = loadmat(array) if suffix == ".mat" else np.load(array, allow_pickle=False)
+            held = {path.stem: loaded} if suffix == ".npy" else loaded
+            return {key: held[key].tolist() for key in held if not key.startswith("__")}
+        if suffix not in _SUFFIXES:
+            return None
+        content = read_file(path, _BYTES_LIMIT)
+        if suffix == ".json":
+            return json.loads(content)
+        if suffix in _YAML:
+            plain = re.sub(rb"^%YAML.*\n|!!opencv-matrix|!!python/\S+", b"", content)
+            return strict_yaml.load_plain(plain)
+        if suffix == ".xml":
+            return _of_xml(ElementTree.fromstring(content))
+        return _of_text(content.decode("utf-8-sig", "replace"))
+    except (OSError, ValueError, EOFError, RecursionError, yaml.YAMLError, ElementTree.ParseError):
+        return None
+
+
+def _of_xml(element: ElementTree.Element) -> Any:
+    if not len(element):
+        numbers = [float(number) for number in _NUMBER.findall(element.text or "")]
+        return numbers if len(numbers) > 1 else numbers[0] if numbers else (element.text or "").strip()
+    children = [(child.tag, _of_xml(child)) for child in element]
+    unique = len({tag for tag, _ in children}) == len(children)
+    return dict(children) if unique else [child for _, child in children]
+
+
+def _of_text(text: str) -> Any:
+    """Lines with as many numbers, and the same words, are rows; four of four numbers are a matrix.
+
+    Lines without words have those of the heading above them.
+    """
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(("#", "%"))]
+    header = re.split(r"[,;\t]", lines[0]) if lines else []
+    if len(header) >= 6 and not _NUMBER.search(lines[0]):
+        names = [re.sub(r"\W.*", "", name.strip().lower()) for name in header]
+        cells = [re.split(r"[,;\t]", line) for line in lines[1:]]
+        return [dict(zip(names, map(_value, row), strict=False)) for row in cells]
+    groups, heading = defaultdict[tuple[str, int], list[Any]](list), ""
+    for line in lines:
+        image = IMAGE.search(line)
+        rest = line.replace(image[0], "") if image else line
+        inside = [_numbers(part) for part in re.findall(r"\[([^\[\]]+)\]", rest)]
+        numbers = next((part for part in inside if len(part) in POSE_SIZES), _numbers(rest))
+        said = _NUMBER.sub("", re.sub(r"\[.*?\]", "", rest))
+        label = " ".join(re.findall(r"[A-Za-z]\w*", said))[:40]
+        if not numbers and not image:
+            heading = label
+            continue
+        label = label or heading
+        row = {"image": image[0], "pose": numbers} if image else numbers
+        groups[label, len(numbers)].append(row)
+    tree: dict[str, Any] = {}
+    for (label, count), group in groups.items():
+        plain = [row for row in group if isinstance(row, list)]
+        if count == 4 and len(plain) % 4 == 0 and plain and np.allclose(plain[3::4], [0, 0, 0, 1], atol=1e-6):
+            value: Any = [plain[at : at + 4] for at in range(0, len(plain), 4)]
+        elif count == 1:
+            value = [row[0] for row in plain]
+        else:
+            value = group
+        while isinstance(value, list) and len(value) == 1:
+            value = value[0]
+        tree[label if label not in tree else f"{label} {count}"] = value
+    return tree.get("") if set(tree) == {""} else tree
+
+
+def _value(text: str) -> Any:
+    numbers = _numbers(text)
+    return numbers[0] if len(numbers) == 1 else numbers or text.strip()
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(number) for number in _NUMBER.findall(text)]

@@ -66,6 +66,8 @@ def read_header(data: bytes) -> ImageHeader:
     elif match := re.match(rb"P5\s+(\d{1,6})\s+(\d{1,6})\s+(\d{1,5})\s", data[:64]):
         width, height, top = (int(g) for g in match.groups())
         header = ImageHeader("pgm", width, height, 1, 1 if top < 256 else 2)
+    elif data.startswith(b"version https://git-lfs"):
+        raise ImageError("is a pointer of Git LFS: fetch the images with `git lfs pull`")
     else:
         raise ImageError("neither PNG, JPEG, BMP nor PGM")
     if not (0 < header.width <= SIDE_LIMIT_PX and 0 < header.height <= SIDE_LIMIT_PX):

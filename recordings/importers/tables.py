@@ -21,6 +21,7 @@ from recordings.importers.messages import Array
 from recordings.importers.trees import IMAGE, IMAGE_SUFFIXES, POSE_SIZES, read_tree
 
 _FILES_LIMIT = 5000
+_PACKED = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
 _HALVES = {
     "position": (re.compile(r"pos|position|trans\w*|tvec|t|xyz|p|location"), (3,)),
     "rotation": (re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues"), (3, 4, 9)),
@@ -87,6 +88,8 @@ class Lies:
     """Values of leaves that describe a board, by lower-case key."""
     words: str = ""
     """The folder's last names, names of files and keys: what may say how the camera is mounted."""
+    packed: list[str] = field(default_factory=list)
+    """Archives, which are not looked into."""
     told: list[Table] | None = None
     """The robot's tables that the user names; None: none was named."""
 
@@ -114,6 +117,8 @@ def look(source: Path, poses: Path | None = None) -> Lies:
             alike = str(path.relative_to(root).parent / _pattern(path.name))
             found.images.setdefault(alike, []).append(path)
             continue
+        if path.suffix.lower() in _PACKED:
+            found.packed.append(path.name)
         tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
         if tree is None:
             continue

@@ -25,6 +25,7 @@ from calibrate.geometry import inverse
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.views import BoardView, ViewSet
+from recordings.errors import ImportSourceError
 from recordings.files import read_file
 from recordings.images import IMAGE_LIMIT_BYTES, ImageError, decode_image, read_header
 from recordings.importers.conventions import Convention, possible
@@ -96,14 +97,18 @@ def _spread(count: int, most: int) -> list[int]:
 
 
 def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: Progress) -> Seen | None:
-    """Find the board in evenly spread images; None: in too few."""
+    """Find the board in evenly spread images; None: in too few. ImportSourceError where none can be read."""
     images: dict[Path, Grey] = {}
     sizes = set[tuple[int, int]]()
     for path in (paths[place] for place in _spread(len(paths), _VOTERS)):
-        with suppress(ImageError, OSError):
+        try:
             header = read_header(data := read_file(path, IMAGE_LIMIT_BYTES))
             images[path] = to_grey(decode_image(data, header.width, header.height))
             sizes.add((header.width, header.height))
+        except (ImageError, OSError) as error:
+            unread = {"place": path.parent, "image": path.name, "reason": str(error)}
+    if not images:
+        raise ImportSourceError("bad-image", **unread)
     if len(sizes) != 1:
         return None
     ((width, height),) = sizes

@@ -13,8 +13,6 @@ from calibrate.imported.board import FEWEST, GUESSED_M, Key, Seen, see_board, to
 from calibrate.imported.mounting import joints_of, joints_rad, mounting
 from calibrate.imported.table_readings import TableReading, decide, is_good, table_readings
 from recordings.errors import ImportSourceError
-from recordings.files import read_file
-from recordings.images import IMAGE_LIMIT_BYTES, ImageError, read_header
 from recordings.importers.conventions import NAMED, Convention, convention
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
 from recordings.importers.messages import Progress
@@ -102,21 +100,8 @@ def believe(
         said = [", ".join(each[:8]) or "none" for each in (there, tables)]
         raise ImportSourceError("no-pairs", source=lies.root, images=said[0], tables=said[1])
     if not tried:
-        for family in families:
-            _require_readable(lies.images[family])
         raise ImportSourceError("no-board-found", source=lies.root, images=", ".join(families))
     return _believed(lies, given, decide(lies, tried, given.convention, given.mount))
-
-
-def _require_readable(images: list[Path]) -> None:
-    """ImportSourceError, by the last one, where none of these can be read."""
-    for path in images:
-        try:
-            read_header(read_file(path, IMAGE_LIMIT_BYTES))
-            return
-        except (ImageError, OSError) as error:
-            reason = str(error)
-    raise ImportSourceError("bad-image", place=path.parent, image=path.name, reason=reason)
 
 
 def _as_before(lies: Lies, told: Dataset, poses: PosesTold) -> Believed:

@@ -31,6 +31,8 @@ _MOST = 12
 """Most readings of one table that are fitted: those by which the board seems to move least."""
 _EXPLAINED = 4
 """Most readings of a refused folder that are tried with their rows shifted, mirrored and the like."""
+_MOVES = 0.01
+"""No arm's poses differ less, metres, radians or more: such a table is of what stands."""
 _STAYS_M, _STAYS_RAD = 0.015, 0.05
 """Median distance of the board from its place above which no reading is believed."""
 
@@ -71,6 +73,8 @@ def table_readings(
         if len(keys) < FEWEST:
             continue
         numbers = table.numbers[[pairs[key] for key in keys]]
+        if np.ptp(numbers, axis=0).max() < _MOVES:
+            continue
         ways = possible(numbers)
         spelt = [way for way in ways if table.rotation and way[0].rotation == table.rotation]
         ways = [way for way in spelt or ways if way[0] != asked]

@@ -124,9 +124,9 @@ def possible(numbers: Array) -> list[tuple[Convention, str]]:
         found = [(Convention("matrix"), f"rows at right angles within {miss:.1g}")] if right else []
         return _in_units(found, numbers[:, 3:12:4])
     ways = _in_units(_rotations(numbers[:, 3:]), numbers[:, :3])
-    if k == 7 or np.abs(numbers[:, -3:]).max() > _TURN:
+    if k == 7 or (np.abs(numbers[:, -3:]).max() > _TURN and np.abs(numbers[:, :3]).max() < 360.5):
         behind = _in_units(_rotations(numbers[:, :-3]), numbers[:, -3:])
-        ways += [(replace(how, rotation_first=True), told) for how, told in behind if not how.degrees]
+        ways += [(replace(how, rotation_first=True), told) for how, told in behind]
     return ways
 
 

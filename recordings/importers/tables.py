@@ -21,7 +21,6 @@ from recordings.importers.messages import Array
 from recordings.importers.trees import IMAGE, IMAGE_SUFFIXES, POSE_SIZES, read_tree
 
 _FILES_LIMIT = 5000
-_PACKED = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
 _HALVES = {
     "position": (re.compile(r"pos|position|trans\w*|tvec|t|xyz|p|location"), (3,)),
     "rotation": (re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues"), (3, 4, 9)),
@@ -117,7 +116,7 @@ def look(source: Path, poses: Path | None = None) -> Lies:
             alike = str(path.relative_to(root).parent / _pattern(path.name))
             found.images.setdefault(alike, []).append(path)
             continue
-        if path.suffix.lower() in _PACKED:
+        if path.suffix.lower() in (".zip", ".tar", ".tgz", ".gz", ".7z", ".rar"):
             found.packed.append(path.name)
         tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
         if tree is None:

@@ -8,12 +8,14 @@ J. Heikkilä, "Geometric camera calibration using circular control points" (2000
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
-from scipy.cluster.hierarchy import fclusterdata
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from calibrate.boards.corners import (
     Grey,
@@ -138,15 +140,23 @@ _GUESSED_PX = 1.5
 
 def count_circles(grey: Grey) -> int:
     """Count the dark blobs, or the light ones, of about one size that lie together: a grid's circles."""
-    counts = [0]
-    for image in (grey, cv2.bitwise_not(grey)):
-        blobs = _blobs(grey.size / 16).detect(image)
-        at, size = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
-        for each in size:
-            alike = at[(size > each / _AS_LARGE) & (size < each * _AS_LARGE)]
-            if len(alike) > 1:
-                counts.append(np.bincount(fclusterdata(alike, _TOGETHER * each, "distance")).max())
-    return int(max(counts))
+    both = (grey, cv2.bitwise_not(grey))
+    return max((len(each) for image in both for each in _together(image, grey.size / 16)), default=0)
+
+
+def _together(image: Any, largest_px: float) -> Iterator[Array]:
+    """Centres (k, 2) px of dark blobs of about one size that lie together, for every size."""
+    blobs = _blobs(largest_px).detect(image)
+    at, size = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
+    if not blobs:
+        return
+    steps = 2 + int(2 * np.log(size.max() / size.min()) / np.log(_AS_LARGE))
+    for each in np.geomspace(size.min(), size.max(), steps):
+        alike = at[(size > each / _AS_LARGE) & (size < each * _AS_LARGE)]
+        if len(alike) > 1:
+            tree = KDTree(alike)
+            groups = connected_components(tree.sparse_distance_matrix(tree, _TOGETHER * each))[1]
+            yield from (alike[groups == group] for group in np.unique(groups))
 
 
 def _blobs(largest_px: float) -> cv2.SimpleBlobDetector:
@@ -162,19 +172,33 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
         if spec.kind is BoardKind.ASYMMETRIC_CIRCLES
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
-    blobs = _blobs(grey.size / (spec.columns * spec.rows))
+    count = spec.columns * spec.rows
     for image in (grey, cv2.bitwise_not(grey)):
-        for clustering in (0, cv2.CALIB_CB_CLUSTERING):
-            found, centres = cv2.findCirclesGrid(
-                image,
-                (spec.columns, spec.rows),
-                flags=kind | clustering,
-                blobDetector=blobs,
-            )
-            if found:
-                ordered = _best_order(np.asarray(centres, dtype=float).reshape(-1, 2), spec)
-                return None if ordered is None else true_centres(grey, ordered, spec)
+        groups = (each for each in _together(image, grey.size / count) if count <= len(each) < 2 * count)
+        for group in chain(groups, [None]):  # OpenCV loses a grid among other blobs
+            for clustering in (0, cv2.CALIB_CB_CLUSTERING):
+                found, centres = cv2.findCirclesGrid(
+                    image if group is None else _painted(group, grey),
+                    (spec.columns, spec.rows),
+                    flags=kind | clustering,
+                    blobDetector=_blobs(grey.size / count),
+                )
+                if found:
+                    seen = np.asarray(centres, dtype=float).reshape(-1, 2)
+                    if group is not None:
+                        seen = group[np.linalg.norm(seen[:, None] - group, axis=2).argmin(axis=1)]
+                    ordered = _best_order(seen, spec)
+                    return None if ordered is None else true_centres(grey, ordered, spec)
     return None
+
+
+def _painted(centres: Array, like: Grey) -> Grey:
+    """A white image with black dots there, and nothing else."""
+    image = np.full_like(like, 255)
+    apart = np.sort(np.linalg.norm(centres[:, None] - centres, axis=2), axis=1)[:, 1]
+    for x, y in centres:
+        cv2.circle(image, (round(x), round(y)), max(2, int(apart.min() / 4)), 0, cv2.FILLED, cv2.LINE_AA)
+    return image
 
 
 def true_centres(grey: Grey, ellipses: Array, spec: BoardSpec) -> Array:

@@ -106,9 +106,9 @@ def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: 
             images[path] = to_grey(decode_image(data, header.width, header.height))
             sizes.add((header.width, header.height))
         except (ImageError, OSError) as error:
-            unread = {"place": path.parent, "image": path.name, "reason": str(error)}
+            unread = ImportSourceError("bad-image", place=path.parent, image=path.name, reason=str(error))
     if not images:
-        raise ImportSourceError("bad-image", **unread)
+        raise unread
     if len(sizes) != 1:
         return None
     ((width, height),) = sizes

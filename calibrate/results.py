@@ -233,3 +233,27 @@ class PeerResult:
     """The paper's method: components of X on the box of equation 22. Such an X is wrong."""
     rigid: bool = True
     """False where the method's raw matrix is not a rigid transform."""
+
+
+class DriftFigures(msgspec.Struct, frozen=True, eq=False):
+    """Result of a drift check, as `calibrate drift-check --json` prints it, too."""
+
+    passed: bool
+    shift: NDArray[np.float64]
+    """(6,) [δt (m), δφ (rad)] in X's parent frame: where the camera is now against where it was installed."""
+    covariance: NDArray[np.float64]
+    """(6, 6) of `shift` if nothing changed."""
+    statistic: float
+    threshold: float
+    p_value: float
+    power_translation: float
+    """Probability to detect a shift of 0.5 mm in the direction that is hardest to see."""
+    power_rotation: float
+    """Probability to detect a turn of 0.1° about the axis that is hardest to see."""
+    views_needed: int | None
+    """Estimated number of views like these that make both probabilities 95 %; None where over 30."""
+    disagreement: float
+    """Squared residuals after the best shift, per degree of freedom: about 1 if the noise is unchanged."""
+    views: int
+    arm_known: bool
+    """False: errors of the arm are not told from a shift, so that a failure proves nothing."""

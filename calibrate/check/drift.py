@@ -28,7 +28,7 @@ from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance, KnownBefore
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.projection import intrinsics_names
-from calibrate.results import SHAPE
+from calibrate.results import SHAPE, DriftFigures
 from calibrate.views import ViewSet, extent_of, require_no_copies
 from recordings.schema.messages import BoardSpec
 
@@ -44,27 +44,7 @@ _LEAST_CORNER_PX = 0.02
 """No corner is found better."""
 
 
-@dataclass(frozen=True, eq=False)
-class DriftCheck:
-    passed: bool
-    shift: Array
-    """(6,) [δt (m), δφ (rad)] in X's parent frame: where the camera is now against where it was installed."""
-    covariance: Array
-    """(6, 6) of `shift` if nothing changed."""
-    statistic: float
-    threshold: float
-    p_value: float
-    power_translation: float
-    """Probability to detect a shift of `SHIFT_M` in the direction that is hardest to see."""
-    power_rotation: float
-    """Probability to detect a turn of `TURN_RAD` about the axis that is hardest to see."""
-    views_needed: int | None
-    """Estimated number of views like these that make both probabilities 95 %; None where over 30."""
-    disagreement: float
-    """Squared residuals after the best shift, per degree of freedom: about 1 if the noise is unchanged."""
-    views: int
-    arm_known: bool
-    """False: errors of the arm are not told from a shift, so that a failure proves nothing."""
+class DriftCheck(DriftFigures, frozen=True, eq=False):
     evidence: Quadratic | None = None
     """What these views alone say of [X ⊕ δ, lens, board shape, errors], around the installed mean."""
 

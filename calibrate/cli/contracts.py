@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Literal
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from calibrate.files.calibration import (
     Arm,
@@ -18,7 +16,16 @@ from calibrate.files.calibration import (
     Views,
 )
 from calibrate.files.validity import Validity
-from calibrate.results import BoardShape, Certificate, CrossValidation, Gate, HoldoutScore, PeerResult, Remark
+from calibrate.results import (
+    BoardShape,
+    Certificate,
+    CrossValidation,
+    DriftFigures,
+    Gate,
+    HoldoutScore,
+    PeerResult,
+    Remark,
+)
 from recordings.schema.messages import Mount
 
 
@@ -76,21 +83,9 @@ class InstalledJson(msgspec.Struct, frozen=True):
     validity: Validity | None
 
 
-class DriftCheckJson(msgspec.Struct, frozen=True):
-    """`calibrate drift-check --json`: the fields of `DriftCheck`, and what follows for what is installed."""
+class DriftCheckJson(DriftFigures, frozen=True, kw_only=True, eq=False):
+    """`calibrate drift-check --json`: the result, and what follows for what is installed."""
 
-    passed: bool
     own_views: bool
-    shift: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    statistic: float
-    threshold: float
-    p_value: float
-    power_translation: float
-    power_rotation: float
-    views_needed: int | None
-    disagreement: float
-    views: int
-    arm_known: bool
     trend: str
     validity: Validity | None

@@ -102,7 +102,7 @@ def drift_check(
     proves_nothing = own and result.passed
     if as_json:
         said = {"passed": result.passed and not own, "own_views": own, "validity": validity}
-        known = vars(result) | said | {"trend": "" if trend is None else trend.text}
+        known = msgspec.structs.asdict(result) | said | {"trend": "" if trend is None else trend.text}
         print_json(DriftCheckJson(**{name: known[name] for name in DriftCheckJson.__struct_fields__}))
     elif proves_nothing:
         out.print(OWN_VIEWS.format(recording=source), style="yellow")

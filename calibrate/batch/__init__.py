@@ -8,11 +8,4 @@ from calibrate.batch.cluster import cluster_workers, dask_workers
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import BatchError, pool
 
-__all__ = [
-    "BatchError",
-    "BatchResult",
-    "cluster_workers",
-    "dask_workers",
-    "pool",
-    "run_batch",
-]
+__all__ = ["BatchError", "BatchResult", "cluster_workers", "dask_workers", "pool", "run_batch"]

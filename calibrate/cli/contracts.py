@@ -6,15 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from calibrate.files.calibration import (
-    Arm,
-    CorrectedArm,
-    FramePose,
-    Lens,
-    SessionReading,
-    Sigma,
-    Views,
-)
+from calibrate.files.calibration import Arm, CorrectedArm, FramePose, Lens, SessionReading, Sigma, Views
 from calibrate.files.validity import Validity
 from calibrate.results import (
     BoardShape,

@@ -14,13 +14,7 @@ import numpy as np
 from calibrate.errors import CalibrationError, CalibrationFileError, InstallError
 from calibrate.files.folders import calibrations_folder, current_version, readable_folder, validity_of
 from calibrate.files.integrity import check_result, read_bounded, verified_plain
-from calibrate.files.validity import (
-    Validity,
-    ValidityReason,
-    ValidityState,
-    require_usable,
-    time_text,
-)
+from calibrate.files.validity import Validity, ValidityReason, ValidityState, require_usable, time_text
 from calibrate.geometry import Array, Transform
 from recordings.files import MAIN_CAMERA
 

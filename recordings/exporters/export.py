@@ -15,7 +15,7 @@ from recordings.errors import RecordingError, disk_error, exists_error
 from recordings.exporters import Target
 from recordings.files import sync_folder
 from recordings.images import encode_png, mosaic_encoding, viewable
-from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
+from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE, Dataset
 from recordings.reader import Recording
 from recordings.schema.messages import ARM_KINEMATICS_NAME, UR_KINEMATICS_NAME, View
 from recordings.schema.viewing import quaternion_xyzw
@@ -66,13 +66,8 @@ def _write_folder(recording: Recording, folder: Path) -> None:
     rows = [[*row, *(of_view or [""] * count)] for row, of_view in zip(rows, joints, strict=True)]
     with (folder / POSES_FILE).open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([header, *rows])
-    described = {
-        "mount": info.mount,
-        "board": msgspec.to_builtins(info.board),
-        "camera": msgspec.to_builtins(info.camera),
-        "robot": msgspec.to_builtins(info.robot),
-        "note": info.note or f"exported from session {info.name} ({info.source})",
-    }
+    note = info.note or f"exported from session {info.name} ({info.source})"
+    described = Dataset(info.mount, info.board, info.camera, info.robot, note)
     (folder / DATASET_FILE).write_bytes(msgspec.yaml.encode(described))
     attached = recording.attachments()
     for name in attached.keys() & {ARM_KINEMATICS_NAME, UR_KINEMATICS_NAME}:

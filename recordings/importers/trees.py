@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections import defaultdict
 from io import BytesIO
 from pathlib import Path
@@ -21,7 +20,7 @@ from recordings.files import read_file
 _BYTES_LIMIT, _ARRAY_LIMIT_BYTES = 4 * 1024 * 1024, 128 * 1024
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 _YAML = (".yaml", ".yml", ".samples", ".calib")
-_SUFFIXES = (*_YAML, ".json", ".toml", ".xml", ".csv", ".txt", ".dat", ".tsv", ".script")
+_SUFFIXES = (*_YAML, ".json", ".xml", ".csv", ".txt", ".dat", ".tsv", ".script")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 IMAGE = re.compile(rf"[^\s,;'\"\[\]]+(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))})\b", re.I)
 """A name of an image."""
@@ -43,8 +42,6 @@ def read_tree(path: Path) -> Any:
         content = read_file(path, _BYTES_LIMIT)
         if suffix == ".json":
             return json.loads(content)
-        if suffix == ".toml":
-            return tomllib.loads(content.decode())
         if suffix in _YAML:
             plain = re.sub(rb"^%YAML.*\n|!!opencv-matrix|!!python/\S+", b"", content)
             return strict_yaml.load_plain(plain)

@@ -21,13 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recordings.images import Pixels, raw_encoding
-from recordings.schema.messages import (
-    CameraModel,
-    CaptureEvent,
-    Matrix4,
-    RobotState,
-    Vector6,
-)
+from recordings.schema.messages import CameraModel, CaptureEvent, Matrix4, RobotState, Vector6
 
 CAMERA_FRAME = "camera"
 JOINT_NAMES = [

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -124,18 +125,14 @@ def one_yaml_each(folder: Path, T: np.ndarray) -> None:
         (folder / f"tcp_pose/{n}.yaml").write_text("\n".join(sorted(lines)))
 
 
-def opencvs_yaml(folder: Path, T: np.ndarray) -> None:
-    file = cv2.FileStorage(str(folder / "end2base.yml"), cv2.FILE_STORAGE_WRITE)
+def opencvs_yaml(folder: Path, T: np.ndarray, name: str = "end2base.yml") -> None:
+    file = cv2.FileStorage(str(folder / name), cv2.FILE_STORAGE_WRITE)
     for n, each in enumerate(T):
         file.write(f"pose_{n}", each)
     file.release()
 
 
-def opencvs_xml(folder: Path, T: np.ndarray) -> None:
-    file = cv2.FileStorage(str(folder / "end2base.xml"), cv2.FILE_STORAGE_WRITE)
-    for n, each in enumerate(T):
-        file.write(f"pose_{n}", each)
-    file.release()
+opencvs_xml = partial(opencvs_yaml, name="end2base.xml")
 
 
 def json_by_image(folder: Path, T: np.ndarray) -> None:
@@ -209,7 +206,7 @@ def stamped(folder: Path, T: np.ndarray) -> None:
 
 
 def numbered_turn_first(folder: Path, T: np.ndarray) -> None:
-    turn = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    turn = Rotation.from_matrix(T[:, :3, :3]).as_rotvec(degrees=True)
     rows = np.column_stack([3 * np.arange(1, len(T) + 1), turn, 1e3 * T[:, :3, 3]])
     np.savetxt(folder / "robot.csv", rows, delimiter=",")
 
@@ -316,9 +313,19 @@ def test_a_described_folder_takes_no_options(tmp_path: Path) -> None:
     assert json.loads(told.stdout)["error"]["code"] == "described"
 
 
-def test_a_folder_without_poses_says_what_is_there(put: Callable[..., Path]) -> None:
+def test_a_folder_without_poses_or_images_says_what_is_there(
+    put: Callable[..., Path], tmp_path: Path
+) -> None:
     with raises("no-pairs", tables="none"):
         believe(look(put(lambda folder, T: None)))
+    (tmp_path / "packed").mkdir()
+    (tmp_path / "packed/data.zip").touch()
+    with raises("no-pairs") as refused:
+        believe(look(tmp_path / "packed"))
+    assert "data.zip" in refused.value.values["images"]
+    (pointer := tmp_path / "1.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    with raises("bad-image", image="1.png"):
+        board.see_board(look(pointer), None, [pointer], lambda *_: None)
 
 
 def named_parts(T: np.ndarray) -> list[dict[str, dict[str, float]]]:

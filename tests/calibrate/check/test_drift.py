@@ -260,7 +260,9 @@ def entry(day: float, shift_mm: float, generation: int = 1, board: BoardSpec | N
     shift = np.r_[shift_mm / 1e3, np.zeros(5)]
     check = quiet_check()
     evidence = Quadratic(N, N[:, :6] @ shift)
-    return entry_of(replace(check, evidence=evidence, shift=shift), day * 86400, generation, "r", board)
+    return entry_of(
+        msgspec.structs.replace(check, evidence=evidence, shift=shift), day * 86400, generation, "r", board
+    )
 
 
 def test_a_trend_is_found_before_a_check_fails(tmp_path: Path) -> None:

@@ -129,13 +129,7 @@ def _views_of(
 
 
 def in_sight(
-    arm: DhArm,
-    mount: Mount,
-    X: Array,
-    Y: Array,
-    rng: np.random.Generator,
-    views: int,
-    reach_rad: float = 0.5,
+    arm: DhArm, mount: Mount, X: Array, Y: Array, rng: np.random.Generator, views: int, reach_rad: float = 0.5
 ) -> Array:
     """Random joints (views, n) around home from which the whole board is seen well."""
     q = np.zeros((0, len(HOME[arm.name])))

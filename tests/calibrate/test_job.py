@@ -90,9 +90,7 @@ def test_a_wrong_board_is_refused_with_what_was_seen(tmp_path: Path) -> None:
         solve_recording(path, JobOptions(board=BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)))
 
 
-def test_a_number_held_fixed_leaves_the_others_their_stated_error(
-    real_session_file: Path,
-) -> None:
+def test_a_number_held_fixed_leaves_the_others_their_stated_error(real_session_file: Path) -> None:
     camera = CameraModel(480, 384, ((620.0, 0, 243), (0, 620, 189), (0, 0, 1)), (-0.1, 0.2, 0.0, 0.0, 0.0))
     options = JobOptions(camera=camera, camera_sigma={"fx": 17.0, "fy": 16.0, "k1": 0.3, "k3": 0.0})
     sigma = solver_options(options, prepare_views(real_session_file, options)).lens_sigma

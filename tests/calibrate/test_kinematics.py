@@ -11,14 +11,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from calibrate.geometry import Array, rotation_log, skew
-from calibrate.kinematics import (
-    MODELS,
-    RobotModel,
-    forward,
-    inverse_many,
-    jacobian,
-    singularity_measure,
-)
+from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, jacobian, singularity_measure
 from tests.calibrate.cells import inverse_nearest
 
 UR10 = MODELS["UR10"]

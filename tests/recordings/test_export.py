@@ -20,13 +20,7 @@ from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
 from tests.command_line import call
-from tests.recordings.small_recording import (
-    make_image,
-    make_info,
-    make_picture,
-    make_view,
-    refused,
-)
+from tests.recordings.small_recording import make_image, make_info, make_picture, make_view, refused
 
 
 def test_a_folder_export_imports_as_the_same_views(small: Path, tmp_path: Path) -> None:

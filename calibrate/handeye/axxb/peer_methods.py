@@ -22,10 +22,7 @@ HAND_EYE = {
     "Andreff": cv2.CALIB_HAND_EYE_ANDREFF,
     "Daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
 }
-ROBOT_WORLD = {
-    "Shah": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH,
-    "Li": cv2.CALIB_ROBOT_WORLD_HAND_EYE_LI,
-}
+ROBOT_WORLD = {"Shah": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "Li": cv2.CALIB_ROBOT_WORLD_HAND_EYE_LI}
 
 
 def opencv_hand_eye(H: Array, C: Array, method: int) -> Array:

@@ -16,14 +16,7 @@ from calibrate.errors import (
     TooFewViewsError,
     UsageError,
 )
-from calibrate.geometry import (
-    Array,
-    inverse,
-    perturb,
-    pose,
-    pose_from_quaternion,
-    rotation_exp,
-)
+from calibrate.geometry import Array, inverse, perturb, pose, pose_from_quaternion, rotation_exp
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet

@@ -220,11 +220,11 @@ def test_it_says_how_many_views_would_do() -> None:
 
 
 def test_a_check_states_its_verdict_and_how_many_views_more(solved_real: SolvedRecording) -> None:
-    strong = replace(quiet_check(), passed=True, power_translation=0.97, power_rotation=0.99)
-    weak = replace(strong, power_translation=0.6, views_needed=8)
+    strong = msgspec.structs.replace(quiet_check(), passed=True, power_translation=0.97, power_rotation=0.99)
+    weak = msgspec.structs.replace(strong, power_translation=0.6, views_needed=8)
     texts = [
         check_text(check, solved_real.calibration)
-        for check in (strong, weak, replace(weak, passed=False, p_value=1e-6))
+        for check in (strong, weak, msgspec.structs.replace(weak, passed=False, p_value=1e-6))
     ]
     assert [text.split(":")[0] for text in texts] == ["PASS", "PASS, low sensitivity", "FAIL"]
     assert "--poses 8" in texts[1] and "--poses" not in texts[2]

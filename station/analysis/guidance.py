@@ -32,7 +32,7 @@ from station.analysis.estimation import as_views
 from station.analysis.found_cell import FoundCell, find_cell
 from station.analysis.worker import BoardDetection, CapturedView
 from station.plan.choose import Objective
-from station.plan.visibility import distances_that_fill, outline, visible
+from station.plan.visibility import distances_that_fill, outline, roll_of, visible
 
 USUAL_FOCAL = 1.3
 """Focal length over the image's longer side that is assumed while nothing is known of the lens."""
@@ -147,7 +147,7 @@ def way_to(wanted: NextView, seen: CapturedView) -> Way:
         return Way("Show the whole board", False)
     target = wanted.camera_from_board
     # The first view may be turned anyhow about the optical axis.
-    rolls = [np.eye(3) if len(wanted.seen) else rotation_exp([0.0, 0.0, _roll(C)]) for C in readings]
+    rolls = [np.eye(3) if len(wanted.seen) else rotation_exp([0.0, 0.0, roll_of(C)]) for C in readings]
     turns = np.array(
         [rotation_log(roll @ target[:3, :3] @ C[:3, :3].T) for roll, C in zip(rolls, readings, strict=True)]
     )
@@ -241,7 +241,7 @@ def _candidates(views: ViewSet, board: BoardSpec, given_up: Sequence[Array]) -> 
     away_m = np.linalg.norm(transform_points(at, middle[None])[:, 0], axis=1)
     reach_m = away_m.min() / _WIDER, max(min(away_m.max() * _WIDER, far_m), away_m.min())
     rng, first = np.random.default_rng([len(at), len(given_up)]), at[0]
-    roll = _roll(first)
+    roll = roll_of(first)
     tilt, axis = _TILT_RAD * np.sqrt(rng.uniform(0, 1, _DRAWN)), rng.uniform(-np.pi, np.pi, _DRAWN)
     tilts, rolls = np.zeros((2, _DRAWN, 3))
     tilts[:, 0], tilts[:, 1] = tilt * np.cos(axis), tilt * np.sin(axis)
@@ -261,11 +261,6 @@ def _candidates(views: ViewSet, board: BoardSpec, given_up: Sequence[Array]) -> 
         if _least_difference(C, at, middle) >= 1.0 and _least_difference(C, tried, middle) >= _OTHER
     ]
     return np.array(new or near.tolist() or pool)[:_WEIGHED]
-
-
-def _roll(C: Array) -> float:
-    """Compute the rotation about the optical axis that is left when the tilt is removed from a pose."""
-    return float(np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1]))
 
 
 def _least_difference(C: Array, at: Array, middle: Array) -> float:

@@ -157,11 +157,15 @@ def expected_view(layout: CellLayout, base_from_flange: Array) -> ExpectedView:
     return ExpectedView(
         distance_m=float(np.linalg.norm(seen[0])),
         tilt_rad=float(np.arccos(np.clip(R[2, 2], -1, 1))),
-        # Rotation about the optical axis that is left after the tilt, the shortest rotation, is removed.
-        roll_rad=float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])),
+        roll_rad=roll_of(R),
         centre_px=(float(pixels[0, 0]), float(pixels[0, 1])),
         coverage=min(1.0, area / (layout.camera.width * layout.camera.height)),
     )
+
+
+def roll_of(R: Array) -> float:
+    """Rotation (rad) about the optical axis that is left of a rotation or pose when the tilt is removed."""
+    return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
 
 
 def planned_pose(layout: CellLayout, number: int, joints_rad: Array, sigma_m: float | None) -> PlannedPose:

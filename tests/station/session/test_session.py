@@ -218,6 +218,8 @@ async def test_no_motion_is_offered_while_nobody_knows_where_the_camera_is(
     with raises("no-guess"):
         await rig.session.prepare(1, purpose, test)
     assert rig.session.store.status.go is None
+    context.cell = replace(context.cell, source="playback")  # no arm moves
+    await rig.session.prepare(1, purpose, test)
 
 
 async def test_nobody_approves_what_the_arm_will_refuse(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,6 +75,17 @@ _Loader.add_constructor(
 )
 
 
+class _ProgramsLoader(yaml.CSafeLoader):  # type: ignore[misc]
+    """YAML 1.1 with the numbers of JSON and yaml-cpp, `1e-05`."""
+
+
+_ProgramsLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"),
+    list("-+0123456789"),
+)
+
+
 def _refuse_traps(content: bytes, limit: int) -> None:
     """Raise MarkedYAMLError for what expands, runs code, takes minutes or the stack (200 kB of brackets)."""
     depth = 0
@@ -102,7 +113,7 @@ def load_plain(content: bytes) -> Any:
     """Plain data of a file that a program wrote. Raises StrictYamlError."""
     try:
         _refuse_traps(content, _BY_PROGRAMS_LIMIT)
-        return yaml.load(content, yaml.CSafeLoader)
+        return yaml.load(content, _ProgramsLoader)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
         raise _no_yaml(error) from None
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recordings.strict_yaml import StrictYamlError, load
+from recordings.strict_yaml import StrictYamlError, load, load_plain
 
 
 class Colour(StrEnum):
@@ -107,3 +107,8 @@ def test_a_part_of_a_larger_file_is_read_with_the_files_lines() -> None:
     assert load(b"kind: b", Chosen, "kind_of_thing") == Chosen("b"), "a file of its own"
     with pytest.raises(StrictYamlError, match=r"line 3: part\.kin: unknown key; did you mean 'kind'"):
         load(b"x: 1\npart:\n  kin: b\n", Chosen, "part")
+
+
+def test_numbers_of_programs_without_a_point_are_numbers() -> None:
+    """As yaml-cpp writes them, and JSON."""
+    assert load_plain(b"[1e-05, -2E3, 1.5e3, 1e-5x]") == [1e-05, -2000.0, 1500.0, "1e-5x"]

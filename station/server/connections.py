@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import logging
 import socket
+import termios
 from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
@@ -27,6 +29,7 @@ from station.protocol.messages import (
     Answer,
     Request,
 )
+from station.protocol.states import RUNNING
 from station.protocol.verbs import VERBS, Stop
 from station.server.approval import Peer
 
@@ -35,6 +38,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 UNSENT_LIMIT_BYTES = 4 * 1024 * 1024
+UNREAD_LIMIT_S = 5.0
+"""Longest time that the client which has control may read nothing while the arm moves: it is lost then."""
 OPEN_REQUESTS_LIMIT = 8
 HANG_UP_S = 1.0
 ACCEPT_BATCH = 32
@@ -82,7 +87,13 @@ class ClientServer:
             line = msgspec.json.encode(Answer(changes=changes)) + b"\n"
             for connection in list(self._connections):
                 if connection.watching:
+                    unread_s, controls = (
+                        connection.unread_s(),
+                        connection.peer.client_id == status.lease.client_id,
+                    )
                     connection.send(line)
+                    if controls and status.state in RUNNING and unread_s > UNREAD_LIMIT_S:
+                        connection.abort()
 
     async def close(self) -> None:
         if self._listening is not None:
@@ -173,6 +184,8 @@ class _Connection:
         self._reader, self._writer, self._handler = reader, writer, handler
         self._publish = publish
         self._tasks: set[asyncio.Task[None]] = set()
+        self._read_s = asyncio.get_running_loop().time()
+        """When the client was last seen to have read everything."""
 
     async def run(self) -> None:
         decoder = msgspec.json.Decoder(Request)
@@ -239,8 +252,20 @@ class _Connection:
             return
         self._writer.write(line)
         if self._writer.transport.get_write_buffer_size() > UNSENT_LIMIT_BYTES:
-            log.warning("client %d (pid %d) does not read: dropped", self.peer.client_id, self.peer.pid)
-            self._writer.transport.abort()
+            self.abort()
+
+    def unread_s(self) -> float:
+        """For how long the client has left something unread: frozen, or its terminal is."""
+        link: socket.socket = self._writer.get_extra_info("socket")
+        now_s = asyncio.get_running_loop().time()
+        if not self._writer.is_closing() and not any(fcntl.ioctl(link.fileno(), termios.TIOCOUTQ, bytes(4))):
+            self._read_s = now_s
+        return now_s - self._read_s
+
+    def abort(self) -> None:
+        """End the connection of a client that does not read, at once."""
+        log.warning("client %d (pid %d) does not read: dropped", self.peer.client_id, self.peer.pid)
+        self._writer.transport.abort()
 
     def drop(self, why: str) -> None:
         log.warning("client %d (pid %d) is dropped: %s", self.peer.client_id, self.peer.pid, why)

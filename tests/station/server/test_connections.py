@@ -17,7 +17,7 @@ import msgspec
 import pytest
 
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import StationState, StationStatus
+from station.cell.status import LeaseStatus, StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.messages import LINE_LIMIT_BYTES, Answer
 from station.protocol.verbs import Go
@@ -224,6 +224,28 @@ async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: R
         assert await client.request("doctor")
         assert len(handler.lost) == 1
     stuck.close()
+
+
+async def test_who_has_control_of_a_moving_arm_and_does_not_read_is_dropped(
+    server: Served, handler: RecordingHandler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frozen `station capture`, or one whose ssh hangs, leaves nobody at the arm."""
+    monkeypatch.setattr("station.server.connections.UNREAD_LIMIT_S", 0.0)
+    control, path = server
+    with socket.socket(socket.AF_UNIX) as frozen:
+        frozen.setblocking(False)
+        frozen.connect(str(path))
+        frozen.send(b'{"id": 1, "verb": "watch"}\n')
+        async with Client(path) as client:
+            statuses = aiter(client.statuses())
+            await anext(statuses)
+            for state in (StationState.IDLE, StationState.MOVING):
+                for holder in (2, 1):
+                    assert not handler.lost
+                    control.publish(StationStatus(state=state, lease=LeaseStatus("anna", holder)))
+                    await anext(statuses)
+            await until(lambda: handler.lost)
+            assert handler.lost == [1]
 
 
 async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tmp_path: Path) -> None:

@@ -100,15 +100,19 @@ def flange_extent(flange: Array) -> Array:
     return np.append(middle, max(float(away), 1e-9))
 
 
+_LINKS = 4.0
+"""Errors of the flange as multiples of one link's, as those of all links add up there."""
+
+
 def smooth_motion(flange: Array, extent: Array) -> Array:
     """Compute the motion (n, 6, 54) of the flange, in base, by the errors of an arm of unknown kinematics.
 
     Shift and turn are polynomials of second degree of the flange's position in `extent` (4,), as of
-    `flange_extent`: three shifts, then three turns, for each of the nine terms.
+    `flange_extent`: three shifts, then three turns, for each of the nine terms, in units of a link's error.
     """
     place = (flange[:, :3, 3] - extent[:3]) / extent[3]
     i, j = np.triu_indices(3)
-    terms = np.concatenate([place, place[:, i] * place[:, j]], axis=1)
+    terms = _LINKS * np.concatenate([place, place[:, i] * place[:, j]], axis=1)
     return np.asarray(np.einsum("nk,ab->nakb", terms, np.eye(6)).reshape(len(flange), 6, -1))
 
 

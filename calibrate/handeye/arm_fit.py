@@ -24,8 +24,8 @@ from calibrate.handeye.priors import Priors
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.views import Observations
 
-SIZES = 0.03 * 2.0 ** np.arange(8)
-"""1σ of the shifts (mm) and turns (mrad) of the arm's links: no arm is exactly as its controller computes."""
+SIZES = 0.0075 * 2.0 ** np.arange(10)
+"""1σ of the shifts (mm) and turns (mrad) of the arm's links, from what no view can tell from none."""
 BENDS = np.array([0.0, 0.1, 0.4, 1.6])
 """1σ of a bracket's compliance, mrad."""
 RIGID = 0.5

@@ -38,7 +38,7 @@ PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
         (priors.ASPECT_SIGMA, 0.001, "pixels square to 0.1 %"),
         (linear.MAX_STEPS, 15, "At most 15 linearisations"),
         (len(arm.FLEX), 9, "and 9 numbers of a bracket's compliance"),
-        (arm_fit.SIZES[[0, -1]], [0.03, 3.84], "eight sizes from 0.03 to 3.84 mm and mrad"),
+        (arm_fit.SIZES[[0, -1]], [0.0075, 3.84], "ten sizes from 0.0075 to 3.84 mm and mrad"),
         ([arm_fit.RIGID, arm_fit.BENDS[-1]], [0.5, 1.6], "a rigid bracket counts one half, others up to 1.6"),
         (readings._CLEAR, 10.0, "10 + ln n more"),
         (drift.FALSE_ALARM, 0.05, "F⁻¹(0.95; 6, ν)"),

@@ -192,3 +192,7 @@ def test_an_arm_without_joints_is_honest_by_its_stated_accuracy(mount):
             assert sum(solution.error_shares.values()) == pytest.approx(1.0)
             covered[stated] += inside(solution, cell.X)
     assert covered[True] == 2 > covered[False]
+
+
+def test_sizes_at_which_noise_and_errors_change_places_do_not_undo_the_fit():
+    assert solve_views(arm_cell("spherical wrist", "eye-in-hand", 0.3, 2).views, QUICK).arm is not None

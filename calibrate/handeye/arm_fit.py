@@ -89,11 +89,7 @@ def estimate_with_arm_errors(
             kept = _explore(sizes, solve, plain.scales)
         else:
             kept = {one: solve(sizes.sigma(one), before.scales) for one, before in kept.items()}
-        peaks = {one: _covariance(linear, solution) for one, solution in kept.items()}
-        kept = {one: kept[one] for one, covariance in peaks.items() if covariance is not None}
         solutions = list(kept.values())
-        if not solutions:
-            raise np.linalg.LinAlgError("no size of the errors leads to a maximum of the posterior")
         log_joint = np.array([sizes.log_chance(one) + found.log_evidence for one, found in kept.items()])
         log_all = float(special.logsumexp(log_joint))
         chances = np.exp(log_joint - log_all)
@@ -102,7 +98,7 @@ def estimate_with_arm_errors(
         # Mean and covariance of the mixture; the latter with the distances of its parts from the mean.
         step = chances @ np.array([s.step for s in solutions])
         by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
-        covariances = np.array([covariance for covariance in peaks.values() if covariance is not None])
+        covariances = np.array([linear.covariance(solution) for solution in solutions])
         off = np.array([solution.step for solution in solutions]) - step
         spread = covariances + off[:, :, None] * off[:, None, :]
         covariance = np.einsum("s,sij->ij", chances, spread)
@@ -132,14 +128,6 @@ def estimate_with_arm_errors(
         mean_of=MeanParts(chances, np.einsum("ij,sji->s", inverse_of(of_X) / 6, spread[:, :6, :6])),
     )
     return with_errors, log_bayes
-
-
-def _covariance(linear: Linear, solution: LinearSolution) -> Array | None:
-    """Compute the covariance; None at no maximum, where noise and errors changed places in too few views."""
-    try:
-        return linear.covariance(solution)
-    except np.linalg.LinAlgError:
-        return None
 
 
 def _solve(

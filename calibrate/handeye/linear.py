@@ -37,6 +37,8 @@ class LinearSolution:
     """(G,) in the order of `Layout`."""
     precision: Array
     """(G, G) information at the present class probabilities, which it takes as certain."""
+    W: Array
+    """(n, 6, 6) what of it each residual has."""
     scales: Scales
     chances: Array
     """(n, K) probability of each noise class, per view."""
@@ -111,7 +113,8 @@ class Linear:
         for _ in range(1 if fit == "nothing" else rounds):
             S, S_inverse = self.noise(scales)
             chances, _ = class_chances(residual, S, S_inverse, scales.shares)
-            WJ = expected(chances, S_inverse) @ self.J
+            W = expected(chances, S_inverse)
+            WJ = W @ self.J
             N = prior.N + _summed(self.J, WJ)
             right = prior.right - np.einsum("nia,ni->a", WJ, self.m)
             if modes is not None:
@@ -135,7 +138,7 @@ class Linear:
         )
         if modes is not None:
             evidence -= modes.cost(step) / scales.lambda_px**2
-        return LinearSolution(step, N, scales, chances, residual, z, evidence)
+        return LinearSolution(step, N, W, scales, chances, residual, z, evidence)
 
     def noise(self, scales: Scales) -> tuple[Array, Array]:
         """Compute the covariances (n, K, 6, 6) of m for each class, and their inverses."""
@@ -169,8 +172,7 @@ class Linear:
 
     def lost(self, solved: LinearSolution) -> Array:
         """Compute the information (G, G) lost because the views' classes are unknown."""
-        W = expected(solved.chances, self.noise(solved.scales)[1])
-        return _summed(self.J, information_lost(solved.chances, solved.z, W) @ self.J)
+        return _summed(self.J, information_lost(solved.chances, solved.z, solved.W) @ self.J)
 
     def predicted(self, scales: Scales, covariance: Array) -> Array:
         """Predict the covariance (n, 6, 6) of m for ordinary views outside the fit of `covariance` (G, G)."""
@@ -179,8 +181,7 @@ class Linear:
 
     def noise_parts(self, solved: LinearSolution, covariance: Array) -> Array:
         """Compute X's whitened variance (3,) from corners, robot translation and robot rotation."""
-        W = expected(solved.chances, self.noise(solved.scales)[1])
-        gain = covariance[:6] @ np.swapaxes(self.J, 1, 2) @ W
+        gain = covariance[:6] @ np.swapaxes(self.J, 1, 2) @ solved.W
         m, rad = np.diag(solved.scales.classes[0]) * np.repeat(np.eye(2), 3, axis=1)[:, None]
         sources = (solved.scales.tau_px**2 * self.V, m, rad)
         parts = [(gain @ source @ np.swapaxes(gain, 1, 2)).sum(axis=0) for source in sources]

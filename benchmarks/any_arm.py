@@ -1,4 +1,4 @@
-"""Arms that nobody described: the chain learned from recorded joints, against independent robot noise."""
+"""Arms that nobody described: the chain learned from recorded joints, against the same views without them."""
 
 from __future__ import annotations
 

@@ -166,6 +166,5 @@ def test_four_corners_of_a_tag_are_noisy_though_little_tells_it(mount):
     """Pose and lens explain nearly all of them. That must not take most corners' weight."""
     views, tag = arm_cell("ur", mount, 0.0, 3, views=20).views, [0, 8, 54, 62]
     few = {"pixels": lambda view: view.pixels[tag], "board_points": lambda view: view.board_points[tag]}
-    four = changed(views, list(range(20)), **few)
-    fit = fit_cell(four, Priors(LensPrior.unknown(four.camera)), 0).plain
+    fit = fit_cell(changed(views, list(range(20)), **few), Priors(LensPrior.unknown(views.camera)), 0).plain
     assert 0.05 < fit.scales.sigma_px <= fit.scales.tau_px < 0.5 and fit.corner_weights.min() > 0.1

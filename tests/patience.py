@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 
 PATIENCE_S = 60.0
 NOTHING_CAME = "it did not come about"
@@ -24,3 +25,18 @@ async def until(condition: Callable[[], object], what: str = NOTHING_CAME) -> No
     while not condition():
         assert time.monotonic() < give_up_s, what
         await asyncio.sleep(0.002)
+
+
+@asynccontextmanager
+async def beats() -> AsyncIterator[list[float]]:
+    """A moment every 10 ms for as long as the loop goes on meanwhile."""
+    found: list[float] = []
+
+    async def beat() -> None:
+        while True:
+            await asyncio.sleep(0.01)
+            found.append(time.monotonic())
+
+    beating = asyncio.create_task(beat())
+    yield found
+    beating.cancel()

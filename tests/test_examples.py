@@ -17,11 +17,7 @@ PROGRAMS = {
     "recordings": RECORDINGS,
     "station": STATION,
 }
-COMMANDS = [
-    (program, name)
-    for program, group in PROGRAMS.items()
-    for name in group.commands  # type: ignore[attr-defined]
-]
+COMMANDS = [(program, name) for program, group in PROGRAMS.items() for name in group.commands]
 
 
 def examples_in(epilog: str | None) -> list[str]:
@@ -34,7 +30,7 @@ def parse(line: str) -> str:
     if not words:
         return ""
     group = PROGRAMS[program]
-    name, command, rest = group.resolve_command(typer.Context(group), words)  # type: ignore[attr-defined]
+    name, command, rest = group.resolve_command(typer.Context(group), words)
     command.make_context(name, rest)
     return str(name)
 
@@ -42,7 +38,7 @@ def parse(line: str) -> str:
 @pytest.mark.parametrize(("program", "name"), COMMANDS)
 def test_every_command_ends_its_help_with_examples_that_parse(program: str, name: str) -> None:
     group = PROGRAMS[program]
-    command = group.resolve_command(typer.Context(group), [name])[1]  # type: ignore[attr-defined]
+    command = group.resolve_command(typer.Context(group), [name])[1]
     given = examples_in(command.epilog)
     assert given
     for line in (line.rpartition(" | ")[2] for line in given):

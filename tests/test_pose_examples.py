@@ -123,7 +123,6 @@ def test_an_example_tells_the_flange_and_the_joints(name: str, tmp_path: Path) -
         env=os.environ | {"PYTHONPATH": str(tmp_path)},
         stdout=subprocess.PIPE,
     ) as told:
-        assert told.stdout is not None
         _, written = read_declaration(told.stdout.readline())
         if name == "tell_csv.py":
             with growing.open("a") as file:

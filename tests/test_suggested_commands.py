@@ -51,7 +51,7 @@ def missing_options(command: str) -> list[str]:
     named = next((word for word in words if not word.startswith("-")), None)
     if named is None or named in ("X", "--X"):
         return []
-    _, found, _ = group.resolve_command(typer.Context(group), [named])  # type: ignore[attr-defined]
+    _, found, _ = group.resolve_command(typer.Context(group), [named])
     options = {name for param in found.params for name in (*param.opts, *param.secondary_opts)}
     return [w for w in words if w.startswith("--") and w.partition("=")[0] not in options]
 

@@ -61,24 +61,19 @@ class WeakRobot(SimulatedRobot):
     def __init__(self, *settings: Any) -> None:
         super().__init__(*settings)
         self.arm.__class__ = WeakArm
-        self.weak_arm.weakness = self.weakness
-
-    @property
-    def weak_arm(self) -> WeakArm:
-        assert isinstance(self.arm, WeakArm)
-        return self.arm
+        self.arm.weakness = self.weakness
 
     def tick(self, monotonic_ns: int, late: bool = False) -> None:
         if self.weakness == "late-watchdog" and self.watchdog_s:
             self.watchdog_s = LATE_S
         super().tick(monotonic_ns, late)
-        arm = self.weak_arm
+        arm = self.arm
         if arm.braked and not arm.moving:
             self._rests()
 
     def _rests(self) -> None:
         """The arm came to rest by a stop."""
-        arm = self.weak_arm
+        arm = self.arm
         q = arm.command
         if self.weakness == "swings-back":
             arm.braked = False
@@ -93,7 +88,7 @@ class WeakRobot(SimulatedRobot):
     last_speed = 0.0
 
     def stop_program(self, reason: str) -> None:
-        arm = self.weak_arm
+        arm = self.arm
         moving = arm.motion
         if arm.moving:
             self.last_speed = arm.command_speed[0]

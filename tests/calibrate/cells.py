@@ -121,7 +121,7 @@ def nudged(views: ViewSet, places: list[int], deltas: Array) -> ViewSet:
     return with_flange(views, flange)
 
 
-def changed(views: ViewSet, places: list[int], **fields) -> ViewSet:  # type: ignore[no-untyped-def]
+def changed(views: ViewSet, places: list[int], **fields) -> ViewSet:
     """The views, at these places with fields replaced by functions of the old view."""
     out: list[BoardView] = list(views.views)
     for i in places:

@@ -105,27 +105,17 @@ def arm_cell(
         X, Y = held, at_home @ held @ first
     else:
         X, Y = at_home @ held @ inverse(first), held
-    return ArmCell(_views_of(arm, mount, X, Y, errors, rng, views, joints), X, Y, arm, errors)
+    q = in_sight(arm, mount, X, Y, rng, views)
+    seen = solve_pnp(views_at(arm, mount, X, Y, errors, rng, q, joints))
+    return ArmCell(seen, X, Y, arm, errors)
 
 
 def later_views(cell: ArmCell, shift: Array, seed: int, views: int) -> ViewSet:
     """Views at other postures of the same cell, whose camera has shifted since."""
     rng, X = np.random.default_rng([seed, 1]), perturb(cell.X, shift)
-    return _views_of(cell.arm, cell.views.mount, X, cell.Y, cell.link_errors, rng, views, True)
-
-
-def _views_of(
-    arm: DhArm,
-    mount: Mount,
-    X: Array,
-    Y: Array,
-    errors: Array,
-    rng: np.random.Generator,
-    views: int,
-    joints: bool,
-) -> ViewSet:
-    q = in_sight(arm, mount, X, Y, rng, views)
-    return solve_pnp(views_at(arm, mount, X, Y, errors, rng, q, joints))
+    arm, mount = cell.arm, cell.views.mount
+    q = in_sight(arm, mount, X, cell.Y, rng, views)
+    return solve_pnp(views_at(arm, mount, X, cell.Y, cell.link_errors, rng, q, True))
 
 
 def in_sight(

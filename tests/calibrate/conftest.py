@@ -58,7 +58,7 @@ def own_file(real_file: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def make_file(solved_real: SolvedRecording, tmp_path: Path):  # type: ignore[no-untyped-def]
+def make_file(solved_real: SolvedRecording, tmp_path: Path):
     """make_file(shift_m, **changes) → path of a calibration file like the real one."""
     count = 0
 

@@ -13,7 +13,6 @@ from calibrate.projection import intrinsics_names
 def test_figures_are_the_solutions_in_the_units_that_their_names_say(solved_real: SolvedRecording) -> None:
     file, found, quality = solved_real.calibration, solved_real.solution, solved_real.calibration.quality
     noise = found.noise
-    assert noise is not None
     np.testing.assert_allclose(file.transform.matrix, found.matrix, atol=1e-12)
     np.testing.assert_allclose(file.covariance, found.covariance)
     # Sigmas are the covariance's own: roots of the traces of its blocks.
@@ -41,7 +40,7 @@ def test_figures_are_the_solutions_in_the_units_that_their_names_say(solved_real
         (quality.noise["robot_deg"], noise.robot_rad),
     ]
     assert [a for a, _ in same] == [b for _, b in same]
-    assert [a for a, _ in milli] == pytest.approx([1000 * b for _, b in milli])  # type: ignore[operator]
+    assert [a for a, _ in milli] == pytest.approx([1000 * b for _, b in milli])
     assert [a for a, _ in degrees] == pytest.approx([np.degrees(b) for _, b in degrees])
     assert sum(quality.error_shares.values()) == pytest.approx(1.0)
 
@@ -51,18 +50,16 @@ def test_a_given_lens_is_called_given_and_judged_by_these_pictures(solved_real: 
     found = solved_real.solution
     assert solved_real.intrinsics is None and lens.found == "given"
     assert "coverage" not in {gate.name for gate in solved_real.gates}
-    assert found.lens_covariance is not None
     assert list(lens.sigma.values()) == pytest.approx(np.sqrt(np.diag(found.lens_covariance)))
     # A given lens is what is known beforehand, no constant: 0.2 % of it, and the pictures say the rest.
     assert lens.matrix == found.camera.matrix != views.camera.matrix
     assert 0 < lens.sigma["fx"] < 0.002 * lens.matrix[0][0]
-    squares = [view_rms_px(v, views.camera, v.camera_from_board) ** 2 for v in views]  # type: ignore[arg-type]
+    squares = [view_rms_px(v, views.camera, v.camera_from_board) ** 2 for v in views]
     assert lens.rms_px == pytest.approx(np.sqrt(np.mean(squares)))
 
 
 def test_a_lens_of_these_pictures_is_called_so_with_its_sigmas(solved: SolvedRecording) -> None:
     lens, found = solved.calibration.intrinsics, solved.intrinsics
-    assert found is not None
     assert (lens.found, lens.rms_px) == ("from these pictures", found.rms_px)
     assert set(lens.sigma) == set(intrinsics_names(lens.model)) and lens.sigma["fx"] > 0
     assert lens.matrix == solved.solution.camera.matrix

@@ -27,5 +27,5 @@ def test_the_example_runs(
         compile(example().replace('cell="simulated")', 'cell="simulated", override="a test")'), "x", "exec"),
         names,
     )
-    assert names["flange_from_camera"].shape == (4, 4)  # type: ignore[attr-defined]
+    assert names["flange_from_camera"].shape == (4, 4)
     assert "views True" in capsys.readouterr().out

@@ -61,7 +61,6 @@ def test_a_good_solution_passes_every_gate(solution: Solution) -> None:
 def spoiled(solution: Solution, name: str) -> tuple[Solution, float]:
     """Solution and bound of the clocks that close this gate alone."""
     seen, folds = solution.observability, solution.cross_validation
-    assert solution.holdout is not None and folds is not None
     other = Explanation(Reading.SHIFTED, 90.0, 1)
     changed = {
         "views": replace(solution, used=solution.used[:5]),

@@ -6,14 +6,11 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from scipy.io import savemat
-from scipy.spatial.transform import Rotation
 
 from benchmarks.misread_poses import MISREAD, said
 from calibrate.files import exports
@@ -29,6 +26,16 @@ from recordings.importers.tables import look
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
 from tests.calibrate.chains import arm_cell
+from tests.calibrate.pose_files import (
+    HOLDERS,
+    IMAGES,
+    PAIRS,
+    in_two_tables,
+    kuka,
+    quaternions,
+    rotation_vectors,
+    unnamed,
+)
 from tests.calibrate.sessions import BOARD_PLACE, Scene, write_session
 from tests.codes import raises
 from tests.command_line import call
@@ -62,7 +69,7 @@ def put(
         write(folder, change(images[1]))
         return folder
 
-    def seen(lies, given, paths, progress):  # type: ignore[no-untyped-def]
+    def seen(lies, given, paths, progress):
         key = (given, json.dumps(lies.facts), len(paths))
         if key not in _SEEN:
             _SEEN[key] = board.see_board(lies, given, paths, progress)
@@ -79,92 +86,7 @@ def put(
 _SEEN: dict[object, board.Seen] = {}
 
 
-def euler(order: str, unit: float = 1.0, degrees: bool = False) -> Callable[[np.ndarray], np.ndarray]:
-    def rows(T: np.ndarray) -> np.ndarray:
-        angles = Rotation.from_matrix(T[:, :3, :3]).as_euler(order, degrees=degrees)
-        return np.column_stack([T[:, :3, 3] * unit, angles])
-
-    return rows
-
-
-def quaternions(T: np.ndarray, roll: int = 0) -> np.ndarray:
-    return np.column_stack([T[:, :3, 3], np.roll(Rotation.from_matrix(T[:, :3, :3]).as_quat(), roll, 1)])
-
-
-def kuka(folder: Path, T: np.ndarray) -> None:
-    np.savetxt(folder / "robot_pose.csv", euler("ZYX", 1e3, True)(T), delimiter=",", header="X,Y,Z,A,B,C")
-
-
-def rotation_vectors(folder: Path, T: np.ndarray) -> None:
-    rotvec = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
-    rows = np.column_stack([T[:, :3, 3], rotvec]).tolist()
-    (folder / "tcp_pose.txt").write_text("\n".join(f"[{row}]" for row in rows))
-
-
-def matrices_in_blocks(folder: Path, T: np.ndarray) -> None:
-    T = T.copy()
-    T[:, :3, 3] *= 1000
-    (folder / "gripper2base.txt").write_text(f"{len(T)}\n")
-    with (folder / "gripper2base.txt").open("a") as file:
-        for each in T:
-            np.savetxt(file, each)
-            file.write("\n")
-
-
-def one_matrix_each(folder: Path, T: np.ndarray) -> None:
-    """As a simulator's plugin writes them beside its images: the TCP in base, rows of text."""
-    for n, each in enumerate(T, 1):
-        np.savetxt(folder / f"tcp_pose{n:05d}.txt", each)
-
-
-def one_yaml_each(folder: Path, T: np.ndarray) -> None:
-    (folder / "tcp_pose").mkdir()
-    for n, row in enumerate(quaternions(T), 1):
-        keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
-        lines = (f"{key}: {value!r}" for key, value in zip(keys, row.tolist(), strict=True))
-        (folder / f"tcp_pose/{n}.yaml").write_text("\n".join(sorted(lines)))
-
-
-def opencvs_yaml(folder: Path, T: np.ndarray, name: str = "end2base.yml") -> None:
-    file = cv2.FileStorage(str(folder / name), cv2.FILE_STORAGE_WRITE)
-    for n, each in enumerate(T):
-        file.write(f"pose_{n}", each)
-    file.release()
-
-
-opencvs_xml = partial(opencvs_yaml, name="end2base.xml")
-
-
-def json_by_image(folder: Path, T: np.ndarray) -> None:
-    rows = [
-        {
-            "robot": "UR10",
-            "image": f"{n + 1}.png",
-            "robot_pose": {"position": row[:3], "orientation": row[3:]},
-        }
-        for n, row in enumerate(quaternions(T, 1).tolist())
-    ]
-    (folder / "samples.json").write_text(json.dumps(rows[::-1]))
-
-
-def arrays(folder: Path, T: np.ndarray) -> None:
-    np.savez(folder / "arm_poses.npz", arm_pose=euler("xyz")(T))
-
-
-@pytest.mark.parametrize(
-    "write",
-    [
-        kuka,
-        rotation_vectors,
-        matrices_in_blocks,
-        one_matrix_each,
-        one_yaml_each,
-        opencvs_yaml,
-        opencvs_xml,
-        json_by_image,
-        arrays,
-    ],
-)
+@pytest.mark.parametrize("write", IMAGES)
 def test_poses_are_read_as_they_are_meant(
     write: Write, put: Callable[..., Path], images: tuple[Path, np.ndarray]
 ) -> None:
@@ -178,46 +100,12 @@ def test_poses_are_read_as_they_are_meant(
     assert shown.square_m == pytest.approx(true.square_m, rel=0.02)
 
 
-def unnamed(folder: Path, T: np.ndarray) -> None:
-    np.savetxt(folder / "poses.txt", euler("ZYX", 1e3, True)(T))
-
-
 def of_a_frame_at_the_table(T: np.ndarray) -> np.ndarray:
     """As arms with a user frame tell them: board and camera are as near to both frames."""
     return np.linalg.inv(BOARD_PLACE) @ T
 
 
-def halves_in_files(folder: Path, T: np.ndarray) -> None:
-    """As OpenCV's hand-eye calls take them."""
-    np.save(folder / "R_gripper2base.npy", T[:, :3, :3])
-    np.save(folder / "t_gripper2base.npy", T[:, :3, 3])
-
-
-def halves_under_headings(folder: Path, T: np.ndarray) -> None:
-    R = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
-    text = (
-        f"{n}:\nRotation:\n{R[n].tolist()}\nTranslation:\n{T[n, :3, 3].tolist()}\n" for n in range(len(T))
-    )
-    (folder / "robot.txt").write_text("\n".join(text))
-
-
-def stamped(folder: Path, T: np.ndarray) -> None:
-    np.savetxt(folder / "tcp.txt", np.column_stack([1.6e9 + np.arange(len(T)) / 7, quaternions(T)]))
-
-
-def numbered_turn_first(folder: Path, T: np.ndarray) -> None:
-    turn = Rotation.from_matrix(T[:, :3, :3]).as_rotvec(degrees=True)
-    rows = np.column_stack([3 * np.arange(1, len(T) + 1), turn, 1e3 * T[:, :3, 3]])
-    np.savetxt(folder / "robot.csv", rows, delimiter=",")
-
-
-def matlabs(folder: Path, T: np.ndarray) -> None:
-    savemat(folder / "poses.mat", {"robotPoses": euler("XYZ", 1, True)(T)})
-
-
-@pytest.mark.parametrize(
-    "write", [halves_in_files, halves_under_headings, stamped, numbered_turn_first, matlabs]
-)
+@pytest.mark.parametrize("write", HOLDERS)
 def test_poses_are_found_in_whatever_holds_them(write: Write, tmp_path: Path) -> None:
     """What their numbers allow is among what the images may decide."""
     T = TURNED.flange_poses()[0]
@@ -328,49 +216,6 @@ def test_a_folder_without_poses_or_images_says_what_is_there(
         board.see_board(look(pointer), None, [pointer], lambda *_: None)
 
 
-def named_parts(T: np.ndarray) -> list[dict[str, dict[str, float]]]:
-    return [
-        {
-            "translation": dict(zip("xyz", row[:3], strict=True)),
-            "rotation": dict(zip("xyzw", row[3:], strict=True)),
-        }
-        for row in quaternions(T).tolist()
-    ]
-
-
-def easy_handeyes(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
-    tables = (("hand_world_samples", robot), ("camera_marker_samples", board))
-    samples = {name: {"transforms": named_parts(T)} for name, T in tables}
-    (folder / "samples.yaml").write_text(json.dumps(samples))
-
-
-def easy_handeye2s(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
-    pairs = zip(named_parts(robot), named_parts(board), strict=True)
-    rows = [{"robot": F, "tracking": C} for F, C in pairs]
-    (folder / "cell.samples").write_text(json.dumps({"parameters": {"name": ""}, "samples": rows}))
-
-
-def in_two_tables(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
-    """Another convention and unit each."""
-    np.savetxt(folder / "robot.txt", euler("ZYX", 1e3, True)(robot), delimiter=",")
-    rotvec = Rotation.from_matrix(board[:, :3, :3]).as_rotvec()
-    np.savetxt(folder / "marker.csv", np.column_stack([board[:, :3, 3], rotvec]), delimiter=",")
-
-
-def moveits(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
-    rows = [
-        {"effector_wrt_world": F.ravel().tolist(), "object_wrt_sensor": C.ravel().tolist()}
-        for F, C in zip(robot, board, strict=True)
-    ]
-    (folder / "poses.yaml").write_text(json.dumps(rows))
-
-
-def in_one_csv(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
-    names = [f"{of}_{n}" for of in ("flange", "board") for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    rows = np.column_stack([quaternions(robot), quaternions(board)])
-    np.savetxt(folder / "pairs.csv", rows, delimiter=",", header=",".join(names), comments="")
-
-
 @pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
 @pytest.mark.parametrize("told", [lambda T: T, np.linalg.inv])
 @pytest.mark.parametrize(("arm", "mount"), [("ur", "eye-in-hand"), ("seven joints", "eye-to-hand")])
@@ -399,20 +244,26 @@ def test_circles_that_nobody_described_are_found(tmp_path: Path) -> None:
             cv2.circle(pixels, (20 + 45 * n, 20), 6, 0, cv2.FILLED)
         cv2.imwrite(str(tmp_path / f"{view.index}.png"), pixels)
     seen = board.see_board(look(tmp_path), None, sorted(tmp_path.glob("*.png")), lambda *_: None)
-    assert seen is not None
     assert (seen.board.kind, seen.board.columns, seen.board.rows) == (circles.kind, 4, 7)
 
 
 MOVEIT = Path(__file__).parents[3] / "shared/datasets/pose-pairs/moveit50.csv"
 
 
-@pytest.mark.parametrize("write", [easy_handeyes, easy_handeye2s, in_two_tables, moveits, in_one_csv])
-def test_pairs_of_poses_are_a_recording_without_pictures(
+@pytest.mark.parametrize("write", PAIRS)
+def test_pairs_of_poses_are_read_as_they_are_meant(
     write: Callable[[Path, np.ndarray, np.ndarray], None], tmp_path: Path
 ) -> None:
-    """Solved; what needs pictures is judged by no gate, and a lens is not invented."""
     robot, board = TURNED.flange_poses()[0], TURNED.camera_from_board()
     write(tmp_path, robot, board)
+    rows = believe(look(tmp_path), Given(mount="eye-in-hand")).rows
+    np.testing.assert_allclose([row.base_from_flange for row in rows], robot, atol=1e-6)
+    np.testing.assert_allclose([row.camera_from_board for row in rows], board, atol=1e-6)
+
+
+def test_pairs_of_poses_are_a_recording_without_pictures(tmp_path: Path) -> None:
+    """Solved; what needs pictures is judged by no gate, and a lens is not invented."""
+    in_two_tables(tmp_path, TURNED.flange_poses()[0], TURNED.camera_from_board())
     rec, file = tmp_path / "pairs.mcap", tmp_path / "pairs.calibration.yaml"
     told = call(main, "import", tmp_path, "-o", rec, "--mount", "eye-in-hand", "--json")
     assert told.returncode == 0, told.stderr
@@ -465,5 +316,6 @@ def test_one_of_two_tables_is_named_the_robots_and_a_reading_told_whole_is_taken
 def test_moveits_own_pairs_give_what_its_test_expects(tmp_path: Path) -> None:
     rec = tmp_path / "pairs.mcap"
     assert call(main, "import", MOVEIT, "-o", rec, "--mount", "eye-to-hand").returncode == 0
-    at = solve_recording(rec).solution.matrix[:3, 3]
-    np.testing.assert_allclose(at, [0.659, -0.249, 0.830], rtol=0.01)
+    solution = solve_recording(rec).solution
+    np.testing.assert_allclose(solution.matrix[:3, 3], [0.659, -0.249, 0.830], rtol=0.01)
+    assert solution.certificate.certified

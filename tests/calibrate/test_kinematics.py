@@ -12,7 +12,6 @@ from scipy.linalg import expm
 
 from calibrate.geometry import Array, rotation_log, skew
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, jacobian, singularity_measure
-from tests.calibrate.cells import inverse_nearest
 
 UR10 = MODELS["UR10"]
 NAMES = sorted(MODELS)
@@ -89,7 +88,6 @@ def test_a_pose_out_of_reach_has_no_inverse(offset_m: list[float]) -> None:
     T = forward(UR10, [0.3, -1.2, 1.6, -1.0, -1.3, 0.4])
     T[:3, 3] += offset_m
     assert inverse_many(UR10, T[None])[1].shape == (0, 6)
-    assert inverse_nearest(UR10, T, np.zeros(6)) is None
 
 
 def test_a_wrist_on_the_shoulder_axis_has_no_inverse() -> None:
@@ -106,18 +104,6 @@ def test_near_singular_poses_are_reached_with_full_precision(q3: float, q5: floa
     solutions = inverse_many(UR10, T[None])[1]
     assert len(solutions) >= 2
     assert np.abs(forward(UR10, solutions) - T).max() < 1e-7
-
-
-@settings(max_examples=60)
-@given(q=st.lists(st.floats(-6.2, 6.2), min_size=6, max_size=6).map(np.array))
-def test_nearest_inverse_keeps_the_branch_and_the_turn(q: Array) -> None:
-    if singularity_measure(UR10, q) < 0.02:
-        return
-    near = np.clip(q + 0.001, -2 * pi, 2 * pi)
-    found = inverse_nearest(UR10, forward(UR10, q), near)
-    assert found is not None
-    assert np.abs(found - q).max() < 1e-6
-    assert np.abs(found).max() <= 2 * pi
 
 
 @settings(max_examples=30)

@@ -56,7 +56,7 @@ def test_arrays_give_what_the_recording_gives(given: dict[str, Any], solved: Sol
     assert list(ours.residuals_px) == [view.index for view in ours.views]
     assert all(np.square(miss).sum(axis=1).mean() < 4.0 for miss in ours.residuals_px.values())
     (arrows,) = ours.plot().axes[0].collections
-    assert len(arrows.get_offsets()) == sum(map(len, ours.residuals_px.values()))  # type: ignore[arg-type]
+    assert len(arrows.get_offsets()) == sum(map(len, ours.residuals_px.values()))
 
 
 def test_a_folder_and_a_recording_are_read_as_arrays(solved: SolvedRecording, tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def test_a_folder_and_a_recording_are_read_as_arrays(solved: SolvedRecording, tm
     np.testing.assert_array_equal(solved.X, solved.solution.matrix)
     for index, rms_px in solved.solution.residual_px.items():
         assert np.sqrt(np.square(solved.residuals_px[index]).sum(axis=1).mean()) < 3 * rms_px + 1
-    assert solved.plot()._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+    assert solved.plot()._repr_png_().startswith(b"\x89PNG")
 
 
 def test_robot_states_as_arrays_are_interpolated_to_the_images() -> None:

@@ -54,7 +54,7 @@ def test_an_alarm_while_the_block_ends_leaves_nothing_behind(monkeypatch: pytest
     def alarm_first(which: int, seconds: float, interval: float = 0.0) -> tuple[float, float]:
         if seconds == 0:
             signal.raise_signal(signal.SIGALRM)
-        return set_timer(which, seconds, interval)  # type: ignore[arg-type]
+        return set_timer(which, seconds, interval)
 
     with monkeypatch.context() as patched:
         patched.setattr(signal, "setitimer", alarm_first)

@@ -34,7 +34,7 @@ async def relay(address: str, controller: str) -> None:
 
         return asyncio.start_server(taken, address, port)
 
-    servers = [await to(port) for port in PORTS]  # type: ignore[misc]
+    servers = [await to(port) for port in PORTS]
     print(controller, flush=True)
     await asyncio.to_thread(os.read, 0, 1)
     for server in servers:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,6 +14,8 @@ from station.devices.aravis import AravisCamera
 from tests.codes import raises
 from tests.gige_vision import description as at
 from tests.gige_vision.camera import EmulatedCamera
+from tests.gige_vision.opened import opened
+from tests.patience import beats
 
 pytestmark = pytest.mark.gige
 CONFIG = CameraConfig(device="127.0.0.1")
@@ -27,11 +28,9 @@ def emulated(lonely_network: None) -> Iterator[EmulatedCamera]:
 
 
 async def test_23_settings_changed_behind_our_back_are_refused(emulated: EmulatedCamera) -> None:
-    camera = AravisCamera(CONFIG)
-    await camera.open()
-    try:
+    async with opened() as camera:
         for change, address, before, value in (
-            (emulated.set_number, at.EXPOSURE, 10_000, 4000),
+            (emulated.set_number, at.EXPOSURE, 1000, 4000),
             (emulated.set_number, at.GAIN, 0, 10),
             (emulated.set_register, at.WIDTH, 1280, 640),
         ):
@@ -40,8 +39,6 @@ async def test_23_settings_changed_behind_our_back_are_refused(emulated: Emulate
                 await camera.capture()
             change(address, before)
         await camera.capture()
-    finally:
-        await camera.close()
 
 
 async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(lonely_network: None) -> None:
@@ -50,19 +47,10 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(lonely_n
         with EmulatedCamera(serial="KJ0042"):
             await camera.open()
             await camera.capture()
-        beats = 0
-
-        async def beat() -> None:
-            nonlocal beats
-            while True:
-                await asyncio.sleep(0.01)
-                beats += 1
-
-        beating = asyncio.create_task(beat())
-        with pytest.raises(CameraError):
-            await camera.capture(timeout_s=4.0)
-        assert beats > 20, "the loop goes on while Aravis waits"
-        beating.cancel()
+        async with beats() as gone_on:
+            with pytest.raises(CameraError):
+                await camera.capture(timeout_s=4.0)
+        assert len(gone_on) > 20, "the loop goes on while Aravis waits"
         with EmulatedCamera(serial="KJ0042"):
             assert (await camera.capture()).pixels.shape == (1024, 1280)
             assert camera.identity.serial == "KJ0042"

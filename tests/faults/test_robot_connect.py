@@ -232,7 +232,6 @@ async def test_a_daemon_that_died_leaves_no_lock(arm: SimulatedController, tmp_p
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
-    assert holder.stdout is not None and holder.stdin is not None
     with holder:
         assert holder.stdout.readline() == b"held\n"
         robot = robot_at(arm.host, tmp_path)

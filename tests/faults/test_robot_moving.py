@@ -76,7 +76,6 @@ async def test_fault(cell: MakeCell, name: str) -> None:
     fault, code = FAULTS[name]
     c = await cell("UR10e" if code == "local-control" else "UR10")
     child_pid = c.control_pid
-    assert child_pid is not None
     error = await c.strike(fault)
     late_too = (
         name == "program stopped" and error.code == Delay.CONTROLLER
@@ -106,7 +105,6 @@ async def test_a_refused_kick_is_told_as_what_is_behind_it(
         kicks_refused = property(lambda _: True, lambda *_: None)
 
     async def refuse(c: Cell) -> None:
-        assert c.robot._child is not None
         c.robot._child.__class__ = Refused
         if behind is not None:
             await c.ask(behind)
@@ -162,7 +160,6 @@ async def test_a_lost_link_is_named_although_it_may_be_back_already(
 async def test_a_control_process_held_up_between_two_moves_is_named_by_the_next(cell: MakeCell) -> None:
     c = await cell()
     control_pid, here = c.control_pid, await c.joints_rad()
-    assert control_pid is not None
     os.kill(control_pid, signal.SIGSTOP)
     await asyncio.sleep(0.4)
     with suppress(ProcessLookupError):  # the station may have ended it
@@ -180,7 +177,6 @@ async def test_control_that_ended_between_two_moves_is_no_trouble_once_it_was_to
     monkeypatch.setattr("station.devices.ur_link.RETRY_S", 600.0)
     c = await cell()
     control_pid = c.control_pid
-    assert control_pid is not None
     os.kill(control_pid, signal.SIGSTOP)
     await until(lambda: c.robot._ended_by is not None)
     with pytest.raises(RobotError):

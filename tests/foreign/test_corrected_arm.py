@@ -54,7 +54,6 @@ def chained(library: str, path: Path, parent: str, child: str, postures: list[di
 
 
 def own(calibration: Calibration) -> Array:
-    assert calibration.arm_table is not None
     return np.array([calibration.arm_table.base_from_flange(row).matrix for row in POSTURES])
 
 

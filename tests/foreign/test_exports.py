@@ -51,7 +51,7 @@ def made(mount: str) -> Calibration:
         calibration_of(make_cell(), RobotIdentity("UR10e"), CameraIdentity(model="camera")),
         mount=said,
         result=FramePose.of(Transform(parent, "camera", matrix)),
-        intrinsics=Lens(*SIZE, tuple(map(tuple, K.tolist())), tuple(DISTORTION), "plumb_bob", 0.1, "given"),  # type: ignore[arg-type]
+        intrinsics=Lens(*SIZE, tuple(map(tuple, K.tolist())), tuple(DISTORTION), "plumb_bob", 0.1, "given"),
         arm_table=offered_arm(FramePose.of(Transform(f"corrected_{parent}", "camera", own))),
     )
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import socket
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
@@ -17,24 +15,13 @@ from station.devices.discovery import discover
 from tests.codes import raises
 from tests.gige_vision import description
 from tests.gige_vision.camera import EmulatedCamera
+from tests.gige_vision.opened import opened
 
 pytestmark = pytest.mark.gige
 
 
-@asynccontextmanager
-async def opened(emulated: EmulatedCamera, **config: Any) -> AsyncIterator[AravisCamera]:
-    with emulated:
-        camera = AravisCamera(CameraConfig(**({"device": "127.0.0.1", "exposure_us": 4000.0} | config)))
-        try:
-            await camera.open()
-            yield camera
-        finally:
-            await camera.close()
-
-
 def error_s(emulated: EmulatedCamera, image: Image) -> float:
     """The told middle of the exposure against the true one."""
-    assert image.time is not None
     begun_ns, ended_ns = emulated.exposed_ns[-1]
     return (image.time.host_monotonic_ns - (begun_ns + ended_ns) / 2) / 1e9
 
@@ -45,51 +32,47 @@ def emulator(**options: Any) -> EmulatedCamera:
 
 @pytest.mark.parametrize("stamp_error_ms", [-2000, 2000])
 async def test_a_stamp_that_cannot_be_is_not_believed(lonely_network: None, stamp_error_ms: int) -> None:
-    emulated = emulator()
-    async with opened(emulated) as camera:
-        believed = (await camera.capture()).time
-        assert believed is not None and believed.source == "latched"  # how well: test_camera_drivers
-        emulated.stamp_error_ns = stamp_error_ms * 1_000_000
-        image = await camera.capture()
-        assert image.time is not None and image.time.source == "arrival"
-        assert abs(error_s(emulated, image)) <= image.time.bound_s
-        assert camera.timing is not None and camera.timing.impossible == 1
+    with emulator() as emulated:
+        async with opened(exposure_us=4000.0) as camera:
+            believed = (await camera.capture()).time
+            assert believed is not None and believed.source == "latched"  # how well: test_camera_drivers
+            emulated.stamp_error_ns = stamp_error_ms * 1_000_000
+            image = await camera.capture()
+            assert image.time is not None and image.time.source == "arrival"
+            assert abs(error_s(emulated, image)) <= image.time.bound_s
+            assert camera.timing is not None and camera.timing.impossible == 1
 
 
 @pytest.mark.parametrize("first", [0, 1, 65_530, 2**40])
 async def test_extended_ids_count_on_beyond_sixteen_bits(lonely_network: None, first: int) -> None:
-    emulated = emulator(extended_ids=True, ids=itertools.count(first))
-    async with opened(emulated, exposure_us=100.0) as camera:
-        ids = [(await camera.capture()).frame_id for _ in range(10)]
+    with emulator(extended_ids=True, ids=itertools.count(first)):
+        async with opened(exposure_us=100.0) as camera:
+            ids = [(await camera.capture()).frame_id for _ in range(10)]
     assert ids == list(range(first, first + 10)) or (first == 0 and ids[1:] == list(range(1, 10)))
 
 
 async def test_a_frame_that_lost_packets_widens_their_gaps(lonely_network: None) -> None:
-    emulated = emulator()
-    async with opened(emulated) as camera:
-        assert emulated.register(description.PACKET_DELAY) == 0
-        emulated.mangle = lambda packets: packets[:5] + packets[6:]
-        emulated.forgets = True
-        for gap_ns in (72_000, 144_000):
-            with raises("frame-incomplete"):
-                await camera.capture()
-            size = emulated.register(description.PACKET_SIZE) & 0xFFFF
-            assert emulated.register(description.PACKET_DELAY) * 8 == pytest.approx(
-                gap_ns * size / 9000, rel=0.01
-            )
+    with emulator() as emulated:
+        async with opened(exposure_us=4000.0) as camera:
+            assert emulated.register(description.PACKET_DELAY) == 0
+            emulated.mangle = lambda packets: packets[:5] + packets[6:]
+            emulated.forgets = True
+            for gap_ns in (72_000, 144_000):
+                with raises("frame-incomplete"):
+                    await camera.capture()
+                size = emulated.register(description.PACKET_SIZE) & 0xFFFF
+                assert emulated.register(description.PACKET_DELAY) * 8 == pytest.approx(
+                    gap_ns * size / 9000, rel=0.01
+                )
 
 
 async def test_the_line_is_set_as_configured(lonely_network: None) -> None:
     class Box:
         async def fire(self) -> Any: ...
 
-    emulated = emulator()
-    config = {"trigger": "hardware", "trigger_line": "Line2"}
-    with emulated:
-        camera = AravisCamera(CameraConfig(device="127.0.0.1", **config), Box())  # type: ignore[arg-type]
-        await camera.open()
-        settings = await camera.settings()
-        await camera.close()
+    with emulator() as emulated:
+        async with opened(Box(), trigger="hardware", trigger_line="Line2") as camera:
+            settings = await camera.settings()
     assert emulated.register(description.TRIGGER_SOURCE) == description.TRIGGER_SOURCES["Line2"]
     assert emulated.register(description.TRIGGER_ACTIVATION) == 0
     assert emulated.register(description.LINE_SELECTOR) == 2 and emulated.register(description.LINE_MODE) == 0
@@ -97,17 +80,17 @@ async def test_the_line_is_set_as_configured(lonely_network: None) -> None:
 
 
 async def test_doctor_sees_every_camera_on_the_wire_and_what_keeps_it_from_use(lonely_network: None) -> None:
-    emulated = emulator()
-    async with opened(emulated) as camera:
-        (found,) = discover()
-        assert (found.model, found.serial) == ("Emulated", "EMU7")
-        assert found.address.startswith("127.0.0.1/") and found.reachable and found.controlled
-        await camera.close()
-        assert not discover()[0].controlled
-        for place, address in ((0x24, "192.168.7.3"), (0x34, "255.255.255.0")):
-            emulated.set_register(place, int.from_bytes(socket.inet_aton(address), "big"))
-        (elsewhere,) = discover()
-        assert elsewhere.address == "192.168.7.3/24" and not elsewhere.reachable
+    with emulator() as emulated:
+        async with opened(exposure_us=4000.0) as camera:
+            (found,) = discover()
+            assert (found.model, found.serial) == ("Emulated", "EMU7")
+            assert found.address.startswith("127.0.0.1/") and found.reachable and found.controlled
+            await camera.close()
+            assert not discover()[0].controlled
+            for place, address in ((0x24, "192.168.7.3"), (0x34, "255.255.255.0")):
+                emulated.set_register(place, int.from_bytes(socket.inet_aton(address), "big"))
+            (elsewhere,) = discover()
+            assert elsewhere.address == "192.168.7.3/24" and not elsewhere.reachable
 
 
 async def test_two_cameras_of_one_model_are_told_apart_by_serial_only(lonely_network: None) -> None:
@@ -116,6 +99,5 @@ async def test_two_cameras_of_one_model_are_told_apart_by_serial_only(lonely_net
         for device in ("", "Emulated"):
             with raises("several-cameras", found=2):
                 await AravisCamera(CameraConfig(device=device)).open()
-        camera = AravisCamera(CameraConfig(device="EMU8"))
-        assert (await camera.open()).serial == "EMU8"
-        await camera.close()
+        async with opened(device="EMU8") as camera:
+            assert camera.identity.serial == "EMU8"

@@ -68,7 +68,6 @@ async def served(config: StationConfig, folder: Path) -> AsyncIterator[Client]:
         stderr=subprocess.DEVNULL,
     ) as daemon:
         try:
-            assert daemon.stdout is not None
             assert await asyncio.to_thread(daemon.stdout.readline), "it did not start"
             async with Client(socket) as client:
                 await wait_until_idle(client)

@@ -7,8 +7,7 @@ import itertools
 import random
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from station.devices.aravis_device import decode
 from tests.codes import raises
 from tests.gige_vision import description
 from tests.gige_vision.camera import EmulatedCamera, Packets
+from tests.gige_vision.opened import opened
 from tests.gige_vision.pixels import encode, numbered_picture
 
 pytestmark = pytest.mark.gige
@@ -31,16 +31,6 @@ SIZE = (640, 480)
 def emulated(lonely_network: None) -> Iterator[EmulatedCamera]:
     with EmulatedCamera(serial="EMU7", size=SIZE) as camera:
         yield camera
-
-
-@asynccontextmanager
-async def opened(**config: Any) -> AsyncIterator[AravisCamera]:
-    camera = AravisCamera(CameraConfig(**({"device": "127.0.0.1", "exposure_us": 1000.0} | config)))
-    try:
-        await camera.open()
-        yield camera
-    finally:
-        await camera.close()
 
 
 async def to_the_bit(emulated: EmulatedCamera, camera: AravisCamera, frames: int) -> None:
@@ -209,7 +199,6 @@ async def test_a_usb_camera_that_was_pulled_out_is_opened_again(emulated: Emulat
     async with opened() as camera:
         first = await camera.capture()
         device = camera._device
-        assert device is not None
         aravis, glib = device._aravis, device._glib
         code = aravis.DeviceError.NOT_CONNECTED
         error = glib.Error.new_literal(aravis.device_error_quark(), "Not connected", code)
@@ -227,7 +216,6 @@ async def test_a_usb_camera_that_was_pulled_out_is_opened_again(emulated: Emulat
 async def test_a_refused_setting_does_not_count_as_a_lost_camera(emulated: EmulatedCamera) -> None:
     async with opened() as camera:
         device = camera._device
-        assert device is not None
         aravis, glib = device._aravis, device._glib
         code = aravis.DeviceError.INVALID_PARAMETER
         error = glib.Error.new_literal(aravis.device_error_quark(), "Invalid", code)

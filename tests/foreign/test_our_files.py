@@ -37,7 +37,7 @@ def fresh(folder: Path) -> Path:
         return writer.finish()
 
 
-def _at(message, stamps):  # type: ignore[no-untyped-def]
+def _at(message, stamps):
     from msgspec.structs import replace
 
     return replace(message, stamps=stamps)

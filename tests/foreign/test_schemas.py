@@ -59,7 +59,6 @@ def test_what_the_commands_print(findings: Findings, tmp_path: Path) -> None:
     assert findings("batch", printed("batch", SAMPLE, "-o", tmp_path / "many")) == []
     follow = [sys.executable, "-m", "calibrate.cli", "follow", *map(str, place)]
     with subprocess.Popen(follow, stdout=subprocess.PIPE) as told:
-        assert told.stdout is not None
         first = told.stdout.readline()
         told.terminate()
     assert findings("follow", json.loads(first)) == []

@@ -112,7 +112,6 @@ def test_the_stops_come_with_their_picture_and_the_right_pose(
         T = np.array(view.base_from_flange)
         np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)
         np.testing.assert_allclose(T[:3, :3], Rotation.from_quat(q).as_matrix(), atol=1e-9)
-        assert view.time_bound_s is not None
         assert 0 < view.time_bound_s < 0.005, "no pose has the stamp of a picture; half a period at most"
         if not kind.startswith("foxglove schemas"):
             turned = np.arange(1.0, 7.0) + 0.1 * number
@@ -199,7 +198,7 @@ def test_what_cannot_be_imported_is_named(tmp_path: Path, name: str) -> None:
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_without_rosbags_the_way_out_is_named(tmp_path: Path, description: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_without_rosbags_the_way_out_is_named(tmp_path: Path, description: Path, monkeypatch) -> None:
     source = write_ros_mcap(tmp_path / "a.mcap")
     ros_types.cache_clear()
     for module in ("rosbags.typesys", "rosbags.highlevel"):

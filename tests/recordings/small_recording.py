@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
@@ -53,24 +54,35 @@ def make_info(**changes: object) -> SessionInfo:
         "created_wall_ns": START_NS,
         "software": {"calibration-station": "test"},
     }
-    return SessionInfo(**(settings | changes))  # type: ignore[arg-type]
+    return SessionInfo(**(settings | changes))
+
+
+PLAYING = RobotState(
+    stamps=Stamps(),
+    joints_rad=(0.0,) * 6,
+    joint_speeds_rad_s=(0.0,) * 6,
+    target_joints_rad=(0.0,) * 6,
+    tcp_pose=(0.0,) * 6,
+    robot_mode=7,
+    safety_mode=1,
+    safety_status_bits=1,
+    runtime_state=2,
+    robot_status_bits=3,
+    speed_scaling=1.0,
+    target_speed_fraction=1.0,
+)
+"""A good arm at rest whose program plays."""
 
 
 def make_state(count: int) -> RobotState:
     joints = tuple(0.1 * count + j for j in range(6))
-    return RobotState(
+    return msgspec.structs.replace(
+        PLAYING,
         stamps=Stamps(count * 2_000_000, START_NS + count * 2_000_000, 100 + count * 0.002),
         joints_rad=joints,
-        joint_speeds_rad_s=(0.0,) * 6,
         target_joints_rad=joints,
         tcp_pose=(0.1, 0.2, 0.3, 0.0, -0.5, 1e-9),
-        robot_mode=7,
-        safety_mode=1,
-        safety_status_bits=1,
-        runtime_state=2,
-        robot_status_bits=3,
         speed_scaling=0.5,
-        target_speed_fraction=1.0,
     )
 
 

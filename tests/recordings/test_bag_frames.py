@@ -104,7 +104,6 @@ def test_limits_come_from_an_arm_that_reports_with_more_noise() -> None:
     seen = tree.track("base", "flange"), np.arange(250, 20_000, 500) * 1_000_000, None
     assert find_stops(*seen, StandstillLimits(), 0.05)[0] == []
     proposed = proposed_limits(*seen, StandstillLimits(), 0.05)
-    assert proposed is not None
     wider, stops = proposed
     assert stops == len(find_stops(*seen, wider, 0.05)[0]) == 10
     assert not proposed_limits(*seen, wider, 0.05)

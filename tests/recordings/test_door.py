@@ -25,7 +25,7 @@ def test_the_example_runs(
     names: dict[str, object] = {}
     exec(textwrap.dedent("\n".join(line for line in lines if line.startswith("    ") or not line)), names)
     told = [list(make_state(count).joints_rad) for count in range(9)]
-    assert names["robot"].joints_rad.tolist() == told  # type: ignore[attr-defined]
+    assert names["robot"].joints_rad.tolist() == told
     assert np.shape(names["joints_rad"]) == (6, 3)
     assert len(capsys.readouterr().out.splitlines()) == 3
 

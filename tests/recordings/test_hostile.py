@@ -95,7 +95,7 @@ def without_summary(content: bytes) -> bytes:
 
 
 def with_chunk(records: bytes, **lies: object) -> bytes:
-    return sealed(SESSION + chunk(records, **lies), DECLARED)  # type: ignore[arg-type]
+    return sealed(SESSION + chunk(records, **lies), DECLARED)
 
 
 def packed_chunk(compression: str, records: bytes, **lies: object) -> bytes:

@@ -42,7 +42,7 @@ def picture_file(tmp_path: Path, image: object, topic: Topic, width: int, height
     data = chunk(
         declared
         + message(1, encode(described))
-        + message(2, image.SerializeToString())  # type: ignore[attr-defined]
+        + message(2, image.SerializeToString())
         + message(3, encode(make_view(0)))
     )
     return write(tmp_path, sealed(session_metadata() + data, declared))

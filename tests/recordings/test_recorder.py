@@ -98,7 +98,7 @@ def test_sync_resolves_only_after_fdatasync_of_what_came_before(
         real_sync(descriptor)
 
     def view(writer: RecordingWriter, written: object) -> None:
-        real_view(writer, written)  # type: ignore[arg-type]
+        real_view(writer, written)
         order.append(f"view {writer.part_path.stat().st_size}")
 
     monkeypatch.setattr(os, "fdatasync", fdatasync)

@@ -35,7 +35,6 @@ def calibration_of(
     in_hand = truth.mount == "eye-in-hand"
     X = perturb(np.array(truth.camera_mount), np.zeros(6) if error is None else error)
     parent, place = ("flange", "base") if in_hand else ("base", "flange")
-    assert truth.camera.matrix is not None
     covariance = np.diag([SIGMA_M**2] * 3 + [SIGMA_RAD**2] * 3)
     return Calibration(
         format=FORMAT,

@@ -37,11 +37,12 @@ from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.cells import cell_config, make_cell
 from tests.patience import until
+from tests.recordings.small_recording import PLAYING
 
 TRUTH = make_cell("paper-binned")
 POSES = 4
 GLIMPSED = np.random.default_rng(1).integers(0, 255, (64, 80), dtype=np.uint8)
-RUNNING, NORMAL, STOPPED = 7, 1, 1
+STOPPED = 1
 
 
 class ArmInMemory:
@@ -86,20 +87,14 @@ class ArmInMemory:
     def _state(self) -> RobotState:
         flange = forward(MODELS["UR10"], self.joints)
         x, y, z, rx, ry, rz = np.concatenate([flange[:3, 3], rotation_log(flange[:3, :3])]).tolist()
-        zero = (0.0,) * 6
-        return RobotState(
+        return msgspec.structs.replace(
+            PLAYING,
             stamps=Stamps(time.monotonic_ns(), time.time_ns(), self._controller_s),
             joints_rad=self.joints,
-            joint_speeds_rad_s=zero,
             target_joints_rad=self.joints,
             tcp_pose=(x, y, z, rx, ry, rz),
-            robot_mode=RUNNING,
-            safety_mode=NORMAL,
-            safety_status_bits=1,
             runtime_state=STOPPED,
             robot_status_bits=1,
-            speed_scaling=1.0,
-            target_speed_fraction=1.0,
         )
 
     def latest(self) -> RobotState:
@@ -289,9 +284,9 @@ class Rig:
         mover = None if by_hand else robot
         cell = Cell(memory_config(), robot, self.camera, source, mover, attachments={"truth.json": b"{}"})
         self.session = Session(cell, root)
-        self.session.context.workers = self.worker  # type: ignore[assignment]
+        self.session.context.workers = self.worker
         if not guides:
-            self.session.freedrive.run = asyncio.Event().wait  # type: ignore[method-assign,assignment]
+            self.session.freedrive.run = asyncio.Event().wait
         self.states: list[StationState] = []
         self.session.store.watch(self._note)
 
@@ -299,6 +294,15 @@ class Rig:
         state = self.session.store.state
         if not self.states or self.states[-1] is not state:
             self.states.append(state)
+
+    def configure(self, **sections: dict[str, object]) -> None:
+        """Change fields of sections of the cell's configuration."""
+        cell = self.session.context.cell
+        changed = {
+            name: msgspec.structs.replace(getattr(cell.config, name), **fields)
+            for name, fields in sections.items()
+        }
+        object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, **changed))
 
     async def start(self) -> None:
         await self.session.start()
@@ -328,11 +332,14 @@ class Rig:
         summary = await self.session.prepare(1, purpose)
         await self.session.go(1, summary.token)
 
+    async def go_until(self, *states: StationState, purpose: Purpose = Purpose.RUN) -> None:
+        await self.give_go(purpose)
+        await self.until(*states)
+
     async def go_until_it_moves(self) -> None:
         """The slow arm is on its way to the first pose."""
         self.arm.slow = True
-        await self.give_go()
-        await self.until(StationState.MOVING)
+        await self.go_until(StationState.MOVING)
 
     async def pause_after_this_pose(self, who: str) -> None:
         self.session.pause(who)
@@ -366,7 +373,6 @@ def crash(rig: Rig) -> None:
             task.cancel()
     recording = rig.session.context.require_recording()
     recording.abandon()
-    assert recording._closing is not None
     recording._closing.join()  # a dead process holds no file
     rig.session.context.recording = None
 

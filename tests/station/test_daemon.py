@@ -28,7 +28,7 @@ def daemon(tmp_path: Path) -> Iterator[Daemon]:
     arm = ArmInMemory()
     cell = Cell(memory_config(), arm, CameraInMemory(), "simulated", arm)
     made = Daemon(cell, tmp_path / "root", tmp_path / "s")
-    made.session.context.workers = WorkerInThisProcess()  # type: ignore[assignment]
+    made.session.context.workers = WorkerInThisProcess()
     yield made
     gc.unfreeze()
 

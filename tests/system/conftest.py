@@ -85,7 +85,6 @@ class DaemonProcess:
         )
 
     async def ready(self) -> None:
-        assert self.process.stdout is not None
         line = await asyncio.wait_for(asyncio.to_thread(self.process.stdout.readline), PATIENCE_S)
         assert line, "the daemon ended at once; see its log"
 
@@ -96,7 +95,6 @@ class DaemonProcess:
         if self.process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 self.process.send_signal(signal.SIGCONT)
-            assert self.process.stdin is not None
             self.process.stdin.close()
             try:
                 self.process.wait(PATIENCE_S)

@@ -50,7 +50,6 @@ class Person:
         )
 
     async def post(self) -> None:
-        assert self._program.stdin is not None
         self._program.stdin.write(b'{"source": "simulated", "robot": "arm of a friend"}\n')
         last, left_s = self.place, time.monotonic()
         start = flange = np.eye(4)
@@ -87,7 +86,6 @@ async def person(control: Path) -> AsyncIterator[Person]:
 
 def still_at(place: PlannedPose, status: StationStatus) -> bool:
     state = status.robot.state
-    assert place.base_from_flange is not None
     away = None if state is None else np.subtract(state.tcp_pose[:3], np.array(place.base_from_flange)[:3, 3])
     return away is not None and float(np.abs(away).max()) < 1e-9 and status.robot.still
 
@@ -115,7 +113,7 @@ async def test_views_by_hand_become_an_installed_calibration_that_knows_the_arm(
             for number, place in enumerate(plan.poses):
                 hand.place = place
                 while status.session.captured <= number:
-                    await status_when(client, lambda s, place=place: still_at(place, s))  # type: ignore[misc]
+                    await status_when(client, lambda s, place=place: still_at(place, s))
                     with contextlib.suppress(RefusedError):  # the station takes a new view by itself
                         await client.call(Record(), timeout_s=60.0)
                     status = await status_when(client, lambda s: s.state is StationState.FREE_DRIVE)

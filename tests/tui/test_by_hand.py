@@ -6,7 +6,6 @@ import msgspec
 
 from station.cell.status import DetectionStatus, GuidanceStatus, PoseStatus, StationState, StationStatus
 from station.protocol import verbs
-from station.tui.app import StationApp
 from station.tui.task import Known, next_action
 from station.tui.widgets.preview import PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, until
@@ -19,7 +18,7 @@ def by_hand(views: int, **guidance: object) -> StationStatus:
     status = msgspec.structs.replace(
         idle(StationState.FREE_DRIVE),
         detection=DetectionStatus(found=True),
-        guidance=GuidanceStatus(outline=OUTLINE, words="Closer", **guidance),  # type: ignore[arg-type]
+        guidance=GuidanceStatus(outline=OUTLINE, words="Closer", **guidance),
     )
     return in_session(status, poses=poses, captured=views)
 
@@ -31,9 +30,8 @@ def outlined(pane: PreviewPane) -> int:
 async def test_the_wanted_view_is_drawn_a_view_sounds_and_is_taken_back(link: FakeLink) -> None:
     link.show(in_session(idle(), name=""))
     app = app_on(link)
-    assert isinstance(app, StationApp)
     bells: list[int] = []
-    app.bell = lambda: bells.append(1)  # type: ignore[method-assign]
+    app.bell = lambda: bells.append(1)
     async with app.run_test(size=(120, 36)) as pilot:
         await until(pilot, lambda: app.known.live is not None)
         await pilot.press("f3")

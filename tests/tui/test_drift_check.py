@@ -86,7 +86,7 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
         await until(pilot, lambda: isinstance(app.screen, JobScreen) and app.screen.said)
         asked = json.loads((installed / "asked").read_text())
         assert asked == ["drift-check", recording, "--root", str(installed / "root")]
-        await until(pilot, lambda: any("holds" in line for line in app.screen.said))  # type: ignore[attr-defined]
+        await until(pilot, lambda: any("holds" in line for line in app.screen.said))
 
 
 def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from station.tui import app as app_module
 from station.tui.app import StationApp
 from station.tui.installed import read_installed
 from station.tui.task import next_action
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, text_of, until
 from tests.tui.test_install import GOOD, OFF
 
 
@@ -73,9 +73,8 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
 
 
 async def test_the_result_says_what_is_installed_and_who_took_it_back(link: FakeLink, root: Path) -> None:
-    app = app_on(link)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
+    async with opened(link) as pilot:
+        app = pilot.app
         await app.show_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
         await until(pilot, lambda: "ready to install" in text_of(app, "#verdict"))
         assert "Nothing is installed" in text_of(app, "#evidence")

@@ -75,7 +75,7 @@ def test_terminal_and_screen_say_the_same_figures() -> None:
 
 async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> None:
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-    pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
+    pilot.app.result_path = str(calibration)
     await pilot.press("4")
     await until(pilot, lambda: "PASS WITH A REASON" in text_of(pilot.app, "#verdict"))
     await pilot.press(*keys)
@@ -135,9 +135,8 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
     root = calibration.parents[2]
     write_calibration(GOOD, calibration)
     install(calibration, root, cell="simulated")
-    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-        pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
+    async with opened(link, notifications=True) as pilot:
+        pilot.app.result_path = str(calibration)
         await pilot.press("4")
         for answer in ("escape", "enter"):
             await until(pilot, lambda: "INSTALLED" in text_of(pilot.app, "#verdict"))
@@ -149,7 +148,7 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
             await until(pilot, lambda: not isinstance(pilot.app.screen, Reason))
         await until(pilot, lambda: current_validity(calibrations_folder(root)).state == "withdrawn")
         await until(pilot, lambda: "withdrawn" in text_of(pilot.app, "#verdict"))
-        assert next_action(pilot.app.known).key != "d"  # type: ignore[attr-defined]
+        assert next_action(pilot.app.known).key != "d"
         await pilot.press("b")
         await until(pilot, lambda: "out of use" in said(pilot))
         assert not isinstance(pilot.app.screen, Reason)
@@ -172,7 +171,7 @@ async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready
     vague = tuple(tuple(81 * value for value in row) for row in GOOD.covariance)
     write_calibration(msgspec.structs.replace(LATER, covariance=vague), calibration)
     async with opened(link) as pilot:
-        pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
+        pilot.app.result_path = str(calibration)
         await pilot.press("4")
         await until(pilot, lambda: "INSTALL" in text_of(pilot.app, "#verdict").upper())
         told = text_of(pilot.app, "#verdict")

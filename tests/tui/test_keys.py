@@ -25,7 +25,7 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
             assert isinstance(pilot.app.screen, ConfirmMotion)
             await until(pilot, lambda: not pilot.app._notifications)
             await pilot.press("f12")
-            await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops)  # type: ignore[misc]
+            await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops)
             assert "go" not in link.verbs
             if answer:
                 await pilot.press(answer)
@@ -75,7 +75,7 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(link: Fa
         await pilot.pause()
         for key, request in requests.items():
             await pilot.press("home", "down", "down", key)
-            await until(pilot, lambda request=request: request in link.asked)  # type: ignore[misc]
+            await until(pilot, lambda request=request: request in link.asked)
 
 
 async def test_the_palette_names_the_screen_s_own_keys_too_and_stop_works_in_it(link: FakeLink) -> None:

@@ -19,7 +19,6 @@ import msgspec
 import pytest
 
 from station.cell.status import GuidanceStatus, StationState
-from station.tui.app import StationApp
 from station.tui.live_page import BROWSERS, LivePage
 from tests.tui.conftest import FakeLink, idle, in_session, opened, said, until
 
@@ -36,11 +35,6 @@ def desktop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.delenv("SSH_CONNECTION", raising=False)
     return asked
-
-
-def page_of(app: StationApp) -> LivePage:
-    assert isinstance(app, StationApp) and app.live_page is not None
-    return app.live_page
 
 
 def answer(page: LivePage, path: str = "/news", method: str = "GET", **headers: str) -> tuple[int, bytes]:
@@ -61,7 +55,7 @@ async def test_a_browser_is_led_there_without_the_token_in_its_arguments(
     async with opened(link) as pilot:
         await pilot.press("o")
         await until(pilot, desktop.exists)
-        door, page = Path(desktop.read_text()), page_of(pilot.app)  # type: ignore[arg-type]
+        door, page = Path(desktop.read_text()), pilot.app.live_page
         assert door.stat().st_mode & 0o777 == 0o600
         assert page.address in door.read_text()
         code, body = await asyncio.to_thread(answer, page)
@@ -75,7 +69,7 @@ async def test_over_ssh_it_says_the_port_to_forward(link: FakeLink, monkeypatch:
     monkeypatch.setenv("SSH_CONNECTION", "10.0.0.1 1 10.0.0.2 22")
     async with opened(link, notifications=True) as pilot:
         await pilot.press("o")
-        await until(pilot, lambda: f"-L {page_of(pilot.app).port}:" in said(pilot))  # type: ignore[arg-type]
+        await until(pilot, lambda: f"-L {pilot.app.live_page.port}:" in said(pilot))
 
 
 @pytest.fixture
@@ -99,15 +93,15 @@ def page() -> Iterator[LivePage]:
     ],
 )
 def test_only_its_person_reads_it_and_nobody_writes(page: LivePage, code: int, asked: dict[str, str]) -> None:
-    assert answer(page, **{k: v.format(port=page.port) for k, v in asked.items()})[0] == code  # type: ignore[arg-type]
+    assert answer(page, **{k: v.format(port=page.port) for k, v in asked.items()})[0] == code
 
 
 async def test_slow_readers_and_a_thousand_requests_reach_neither_the_daemon_nor_stop(link: FakeLink) -> None:
     link.answers["preview"] = link.answers["preview"].__class__("x" * 5_000_000)  # more than a link's buffers
     async with opened(link) as pilot:
         await pilot.press("o")
-        await until(pilot, lambda: pilot.app.live_page)  # type: ignore[attr-defined]
-        page = page_of(pilot.app)  # type: ignore[arg-type]
+        await until(pilot, lambda: pilot.app.live_page)
+        page = pilot.app.live_page
         host, token = page.address[len("http://") :].split("/#")
         asked = f"GET /news HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
         slow = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(BROWSERS)]

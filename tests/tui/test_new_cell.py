@@ -124,7 +124,6 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path, monkeypatch: p
     assert not [what for what in counts if what.startswith(("upload", "script"))], counts
     config, _ = load_config(tmp_path / "station.yaml")
     assert config.board == truth.board and config.mount == truth.mount
-    assert config.camera_guess is not None and config.board_guess is not None
     for guess, true in ((config.camera_guess, truth.camera_mount), (config.board_guess, truth.board_place)):
         off = difference(guess_matrix(guess), np.array(true))
         assert np.linalg.norm(off[:3]) < 3 * guess.sigma_m and np.linalg.norm(off[3:]) < 3 * guess.sigma_rad

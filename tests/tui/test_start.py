@@ -69,7 +69,7 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink, tmp_path: Path
             await pilot.pause()
             pilot.app.clear_notifications()
             await pilot.press(key)
-            await until(pilot, lambda w=words: w in said(pilot))  # type: ignore[misc]
+            await until(pilot, lambda w=words: w in said(pilot))
         assert not {"go", "prepare", "finish"} & set(link.verbs)
 
 

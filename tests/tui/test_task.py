@@ -22,7 +22,7 @@ from station.tui.dialogs import Confirm, ConfirmMotion, Reason
 from station.tui.frame import StopBlock, bar_line, next_line, rail_line
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from tests.recordings.small_recording import make_state
-from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, in_session, opened, said, text_of, until
+from tests.tui.conftest import SUMMARY, FakeLink, idle, in_session, opened, said, text_of, until
 
 SIZES = [(80, 24), (160, 48)]
 HELD = "protective stop: find what the arm ran into, then enable it again on the pendant"
@@ -166,17 +166,17 @@ async def test_stop_stands_whole_on_every_screen_and_question(
             await pilot.press(key)
             await until(pilot, lambda: whole(pilot.app.screen))
             await pilot.press("f12")
-            await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops)  # type: ignore[misc]
+            await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops)
             drawn = pilot.app.screen._compositor.render_strips()
             assert any("SIMULATED" in strip.text for strip in drawn)
-            assert str(pilot.app.screen.query_one("#bar").render()).split()[0].lower() in DIGITS  # type: ignore[attr-defined]
+            assert str(pilot.app.screen.query_one("#bar").render()).split()[0].lower() in DIGITS
         for window in WINDOWS:
-            pilot.app.push_screen(window())  # type: ignore[arg-type,misc]
+            pilot.app.push_screen(window())
             await until(pilot, lambda: whole(pilot.app.screen))
             assert "SIMULATED" in text_of(pilot.app, "#bar")
             stops = link.verbs.count("stop")
             await pilot.click(StopBlock)
-            await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops + 1)  # type: ignore[misc]
+            await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops + 1)
             link.show(idle(StationState.STOPPED))  # what is known goes on while a question is open
             await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
             assert pilot.app.screen.query_one(StopBlock).latched
@@ -212,7 +212,7 @@ async def test_the_screens_have_no_stop_for_an_arm_that_a_person_moves(
         await pilot.press("f12")  # the daemon answers whose STOP it is
         await until(pilot, lambda: "stop" in link.verbs)
         link.show(None)  # what arm the next daemon has is not known: STOP is for it, too
-        await until(pilot, lambda: pilot.app.known.live is None)  # type: ignore[attr-defined]
+        await until(pilot, lambda: pilot.app.known.live is None)
         await pilot.press("f12")
         await until(pilot, lambda: link.send_stop() in said(pilot))
 
@@ -221,8 +221,7 @@ async def test_without_colours_stop_and_chips_are_reversed(
     link: FakeLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NO_COLOR", "1")
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         strips = pilot.app.screen._compositor.render_strips()
         for filter_ in pilot.app._filters:
             strips = [strip.apply_filter(filter_, pilot.app.background_colors[1]) for strip in strips]

@@ -35,7 +35,7 @@ async def begin(pilot: Pilot[None], link: FakeLink, calibration: Path, daemon: D
     """On the result screen, `h`."""
     link.answers["observe"], link.config = daemon.observation, daemon.config
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-    pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
+    pilot.app.result_path = str(calibration)
     await pilot.press("4")
     await until(pilot, lambda: "install" in text_of(pilot.app, "#verdict").lower())
     await pilot.press("h")
@@ -47,7 +47,7 @@ async def touch(pilot: Pilot[None], link: FakeLink, daemon: Daemon, beside_mm: t
     place = board_points(daemon.truth.board)[corner] + np.array(beside_mm) / 1000
     status = msgspec.structs.replace(idle(), robot=daemon.touching(place).robot)
     link.show(status)
-    await until(pilot, lambda: pilot.app.known.status == status)  # type: ignore[attr-defined]
+    await until(pilot, lambda: pilot.app.known.status == status)
     await pilot.press("enter")
 
 

@@ -35,7 +35,6 @@ def printed(sheet: Sheet) -> np.ndarray:
 
 def page_mm(content: bytes) -> tuple[float, float]:
     box = re.search(rb"/MediaBox *\[ *0 0 ([\d.]+) ([\d.]+) *\]", content)
-    assert box is not None
     return float(box[1]) / 72 * 25.4, float(box[2]) / 72 * 25.4
 
 
@@ -80,14 +79,12 @@ def test_pdf_and_svg_are_pages_of_their_true_size() -> None:
     sheet = board_sheet(BOARDS[0], "A4")
     assert page_mm(sheet.encode("pdf")) == pytest.approx((297.0, 210.0), abs=1e-3)
     size_pt = re.search(rb'width="([\d.]+)pt" height="([\d.]+)pt" viewBox="0 0 \1 \2"', sheet.encode("svg"))
-    assert size_pt is not None
     assert float(size_pt[1]) / 72 * 25.4 == pytest.approx(297.0, abs=1e-3)
     assert sheet.encode("svg") == board_sheet(BOARDS[0], "A4").encode("svg")
 
 
 def test_the_print_carries_its_own_configuration() -> None:
     text = re.search(r"board: (\{.*\})", board_sheet(BOARDS[5]).encode("svg").decode())
-    assert text is not None
     assert yaml.safe_load(text[1]) == {
         "kind": "charuco",
         "columns": 6,
@@ -102,7 +99,7 @@ def test_the_print_carries_its_own_configuration() -> None:
 @pytest.mark.parametrize(
     ("paper", "code"), [("A4", "paper-too-small"), ("A3", None), ("letter", "paper-unknown")]
 )
-def test_a_board_larger_than_the_paper_is_refused(paper, code) -> None:  # type: ignore[no-untyped-def]
+def test_a_board_larger_than_the_paper_is_refused(paper, code) -> None:
     try:
         assert board_sheet(BOARDS[1], paper).width_mm == 420.0
     except BoardError as refused:

@@ -106,7 +106,6 @@ def test_errors_of_an_arm_that_nobody_described_are_no_shift(mount: Mount) -> No
     for seed in range(900, 902):
         cell = arm_cell("seven joints", mount, 0.3, seed)
         solution = solve_views(cell.views, QUICK)
-        assert solution.posterior is not None
         known = KnownCell.of(solution.posterior, solution.camera)
         views = later_views(cell, np.zeros(6), 0, 6)
         still = find_shift(views, known)
@@ -127,7 +126,6 @@ def test_without_joints_an_arm_errs_smoothly_at_other_postures(mount: Mount) -> 
     for joints in (True, False):
         cell = arm_cell("ur", mount, 0.3, 902, joints=joints)
         solution = solve_views(cell.views, QUICK)
-        assert solution.posterior is not None
         known = KnownCell.of(solution.posterior, solution.camera)
         still = [_with_joints(later_views(cell, np.zeros(6), k, 6), known, lambda _: None) for k in range(4)]
         assert min(check.p_value for check in still) > 1e-3 and not still[0].arm_known
@@ -177,7 +175,6 @@ def test_the_file_gives_back_what_the_fit_left_known(solved_real: SolvedRecordin
     before, after = known_cell(solved_real.calibration), known_cell(read_calibration(path))
     np.testing.assert_array_equal(after.covariance, before.covariance)
     np.testing.assert_array_equal(after.mean.X, before.mean.X)
-    assert after.flange_extent is not None
     np.testing.assert_array_equal(after.flange_extent, before.flange_extent)
     views = solved_real.views
     assert (

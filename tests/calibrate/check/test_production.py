@@ -6,30 +6,28 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import yaml
 
-from calibrate.boards.model import board_points
 from calibrate.check.production import EARLIER, EarlierPictures, check_production
 from calibrate.cli import main
 from calibrate.errors import TooFewViewsError
 from calibrate.files.install import install
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState
-from calibrate.geometry import Array, inverse, perturb, pose, quaternion_from_matrix, rotation_exp
+from calibrate.geometry import inverse, perturb, pose, quaternion_from_matrix, rotation_exp
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.projection import project_at
 from calibrate.views import ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec
+from station.simulation.renderer import render
 from tests.calibrate.chains import ArmCell, arm_cell, later_views
-from tests.calibrate.sessions import looking
+from tests.calibrate.sessions import LIGHT, looking
 from tests.codes import raises
 from tests.command_line import call
 
@@ -52,7 +50,6 @@ def four_corners(views: ViewSet) -> ViewSet:
 
 def test_a_shift_is_noticed_within_ten_pictures_and_nothing_else(cell: ArmCell) -> None:
     solution = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
-    assert solution.posterior is not None
     known = KnownCell.of(solution.posterior, solution.camera).with_board(BoardTolerance())
     before = four_corners(later_views(cell, STILL, 1, EARLIER))
     earlier = EarlierPictures.of(before, known)
@@ -86,34 +83,17 @@ class Production:
         (folder / "dataset.yaml").write_text(yaml.safe_dump(stated))
         (folder / "poses.csv").write_text("image,x,y,z,qx,qy,qz,qw\n")
 
-    def take(self, pictures: int, tag: bool = True) -> None:
+    def take(self, pictures: int) -> None:
         for _ in range(pictures):
             F = self.flanges[self.count % len(self.flanges)]
             true = perturb(F, self.rng.normal(size=6) * np.repeat([2e-5, 2e-5], 3))
             name = f"{self.count:04}.png"
-            cv2.imwrite(str(self.folder / name), self._drawn(inverse(true @ self.X) @ TAG_PLACE, tag))
+            seen = render(self.lens, TAG, inverse(true @ self.X) @ TAG_PLACE, LIGHT, self.rng)
+            cv2.imwrite(str(self.folder / name), seen)
             numbers = [*F[:3, 3], *quaternion_from_matrix(F[:3, :3])]
             with (self.folder / "poses.csv").open("a") as file:
                 file.write(",".join([name, *(repr(float(x)) for x in numbers)]) + "\n")
             self.count += 1
-
-    def _drawn(self, C: Array, tag: bool) -> Any:
-        cell_px = 20
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-        marker = cv2.aruco.generateImageMarker(dictionary, 0, 8 * cell_px)
-        sheet = np.full((10 * cell_px, 10 * cell_px), 230, np.uint8)
-        if tag:
-            sheet[cell_px:-cell_px, cell_px:-cell_px] = marker
-        near, far = cell_px - 0.5, 9 * cell_px - 0.5
-        corners = np.array([[near, near], [far, near], [near, far], [far, far]], np.float32)
-        H = cv2.getPerspectiveTransform(
-            corners, project_at(self.lens, C, board_points(TAG)).astype(np.float32)
-        )
-        size = (2 * self.lens.width, 2 * self.lens.height)
-        finer = np.array([[2.0, 0, 0.5], [0, 2.0, 0.5], [0, 0, 1]])
-        drawn = cv2.warpPerspective(sheet, finer @ H, size, flags=cv2.INTER_LINEAR, borderValue=230)
-        small = cv2.resize(drawn, (self.lens.width, self.lens.height), interpolation=cv2.INTER_AREA)
-        return np.clip(small + self.rng.normal(size=small.shape) * 2, 0, 255).astype(np.uint8)
 
 
 @pytest.fixture

@@ -146,7 +146,6 @@ def test_a_view_given_twice_is_refused_by_solve_and_check(
         run("solve", twice, cwd=tmp_path),
         run("drift-check", twice, "--calibration", real_file, cwd=tmp_path),
     ):
-        assert done.error is not None
         refused(done, 1, done.error.code, "--without 11")
 
 

@@ -70,7 +70,6 @@ def test_solve_install_check_rollback(real_session_file: Path, real_file: Path, 
     second = tmp_path / "second.yaml"
     calibration = read_calibration(real_file)
     moved = shifted(calibration, 0.02)
-    assert calibration.posterior is not None
     arm_error = tuple(map(tuple, np.diag(np.full(6, 1e-10)).tolist()))  # stated, as by --robot-accuracy-mm
     posterior = msgspec.structs.replace(
         calibration.posterior, X=moved.result.matrix, stated_arm_error=arm_error

@@ -25,7 +25,6 @@ def root(tmp_path: Path, make_file: MakeFile) -> Path:
 
 
 def lines(process: subprocess.Popen[str]) -> Iterator[Any]:
-    assert process.stdout is not None
     return (json.loads(line) for line in process.stdout)
 
 
@@ -67,6 +66,5 @@ def test_every_change_is_one_line(ended: list[subprocess.Popen[str]], root: Path
 def test_it_ends_when_nobody_reads(ended: list[subprocess.Popen[str]], root: Path) -> None:
     process = follow(ended, root)
     next(lines(process))
-    assert process.stdout is not None
     process.stdout.close()
     assert process.wait(PATIENCE_S) == 0

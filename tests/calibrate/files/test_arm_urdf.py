@@ -214,7 +214,7 @@ def test_another_arm_is_refused_with_the_distance(calibration: Calibration) -> N
 def test_what_is_no_plain_urdf_is_refused(solved_real: SolvedRecording, spoil: object) -> None:
     calibration = with_arm(solved_real.calibration, "seven joints")
     with raises("urdf", UsageError):
-        exports.export(calibration, "urdf", arm=spoil(urdf_of("seven joints")))  # type: ignore[operator]
+        exports.export(calibration, "urdf", arm=spoil(urdf_of("seven joints")))
 
 
 def test_names_and_formats_that_do_not_fit_are_refused(solved_real: SolvedRecording) -> None:

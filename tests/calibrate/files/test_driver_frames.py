@@ -103,7 +103,6 @@ def written(frames: Frames, kind: str, folder: Path) -> Path:
 def published(launch: bytes) -> tuple[str, str, Array]:
     """Parent, child and parent_from_child by static_transform_publisher's rule."""
     found = re.search(r"arguments=(\[.*?\])", launch.decode(), re.DOTALL)
-    assert found is not None
     words = ast.literal_eval(found[1])
     said = dict(zip(words[::2], words[1::2], strict=True))
     R = Rotation.from_quat([float(said[f"--q{axis}"]) for axis in "xyzw"]).as_matrix()
@@ -138,7 +137,6 @@ def test_the_driver_s_lens_is_where_it_was_calibrated(
     assert {link.get("name") for link in of_urdf.iter("link")} >= {parent, top}
     (joint,) = of_urdf.findall("joint")
     origin = joint.find("origin")
-    assert origin is not None
     numbers = [tuple(map(float, origin.attrib[name].split())) for name in ("xyz", "rpy")]
     np.testing.assert_allclose(matrix(*numbers), T, atol=1e-12)
 
@@ -150,7 +148,7 @@ def test_without_a_driver_s_frames_ours_have_names_of_their_own(
     frames = DRIVERS[driver][2]
     parent, child, T = published(export(calibration, "ros-launch"))
     joined(frames, parent, child, T)
-    ours = {joint.find("child").get("link") for joint in  # type: ignore[union-attr]
+    ours = {joint.find("child").get("link") for joint in
             ElementTree.fromstring(export(calibration, "urdf")).iter("joint")}  # fmt: skip
     assert not ours & {*frames, *(above for above, _, _ in frames.values())}
 
@@ -163,15 +161,15 @@ def test_frames_that_are_turned_against_the_controllers_are_turned(
     turned, own = ("left_flange", "left_tool0") if in_hand else ("left_base_link", "left_base")
     names = {"flange" if in_hand else "base": turned}
     rpy = (np.pi / 2, 0.0, np.pi / 2) if in_hand else (0.0, 0.0, np.pi)
-    parent, _, T = published(export(calibration, "ros-launch", FrameNames(**names)))  # type: ignore[arg-type]
+    parent, _, T = published(export(calibration, "ros-launch", FrameNames(**names)))
     assert parent == turned
     np.testing.assert_allclose(T, matrix((0, 0, 0), rpy) @ calibration.transform.matrix, atol=1e-12)
     other = msgspec.structs.replace(calibration, robot=RobotIdentity("irb1200"))
     with raises("frame-turned", frame=turned, own=own):
-        export(other, "ros-launch", FrameNames(**names))  # type: ignore[arg-type]
+        export(other, "ros-launch", FrameNames(**names))
     place = (0.0, 0.1, 0.2), (0.0, np.pi / 2, 0.0)
     path = written({own: (turned, *place)}, "urdf", tmp_path)
-    told = FrameNames(fixed=fixed_frames([path]), **names)  # type: ignore[arg-type]
+    told = FrameNames(fixed=fixed_frames([path]), **names)
     _, _, T = published(export(other, "ros-launch", told))
     np.testing.assert_allclose(T, matrix(*place) @ calibration.transform.matrix, atol=1e-12)
 
@@ -191,7 +189,7 @@ def test_what_would_give_a_frame_two_parents_or_no_lens_is_refused(
         export(calibration, "zivid", FrameNames(camera=lens, attach=top, fixed=fixed))
     both = {**frames, "camera_depth_frame": ("odom", (0, 0, 0), (0, 0, 0))}
     with raises("two-parents", frame="camera_depth_frame"):
-        fixed_frames([written(frames, "yaml", tmp_path), written(both, "urdf", tmp_path)])  # type: ignore[arg-type]
+        fixed_frames([written(frames, "yaml", tmp_path), written(both, "urdf", tmp_path)])
     for content in ("", "<robot", "no: transforms", "[", "child_frame_id: a"):
         (tmp_path / "none").write_text(content)
         with raises("no-fixed-frames"):

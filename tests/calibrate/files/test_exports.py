@@ -92,7 +92,6 @@ def flange_of_chain(origins: list[Array], joints: Array) -> Array:
 def check_chain(origins: list[Array], calibration: Calibration) -> None:
     """To 1e-9 m (the corrected arm's own function) at postures anywhere, and farther from the nominal arm."""
     arm = calibration.arm_table
-    assert arm is not None
     for joints in np.random.default_rng(0).uniform(-3, 3, (20, 6)):
         found, own = flange_of_chain(origins, joints), arm.base_from_flange(joints)
         assert (own.parent, own.child) == ("corrected_base", "corrected_flange")
@@ -180,7 +179,6 @@ def test_simulated_is_stamped_and_a_session_name_never_leaves_the_comment(
 def urdf_origin(joint: ElementTree.Element) -> Array:
     """URDF's rule: rpy about fixed axes, R = Rz Ry Rx."""
     origin = joint.find("origin")
-    assert origin is not None
     xyz = [float(v) for v in origin.attrib["xyz"].split()]
     r, p, y = (float(v) for v in origin.attrib["rpy"].split())
     R = rotation_exp([0, 0, y]) @ rotation_exp([0, p, 0]) @ rotation_exp([r, 0, 0])
@@ -197,11 +195,11 @@ def test_a_name_with_hyphens_does_not_end_the_urdfs_comment(calibration: Calibra
 def test_urdf_chain_ends_in_the_optical_frame(calibration: Calibration) -> None:
     tree = ElementTree.fromstring(export(calibration, "urdf"))
     first, second = tree.findall("joint")
-    assert first.find("parent").attrib["link"] == parent_of(calibration)  # type: ignore[union-attr]
+    assert first.find("parent").attrib["link"] == parent_of(calibration)
     assert (
         first.find("child").attrib["link"] == second.find("parent").attrib["link"] == "camera_calibrated_link"
-    )  # type: ignore[union-attr]
-    assert second.find("child").attrib["link"] == "camera_calibrated_optical_frame"  # type: ignore[union-attr]
+    )
+    assert second.find("child").attrib["link"] == "camera_calibrated_optical_frame"
     body, optical = urdf_origin(first), urdf_origin(second)
     same(body @ optical, calibration)
     # REP-103: what the optical frame has ahead (z), the body has along x; optical right (x) is body -y.

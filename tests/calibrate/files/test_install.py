@@ -47,7 +47,7 @@ def test_the_next_step_of_a_solve_is_one_that_works() -> None:
     )
 
 
-def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_install_list_rollback(make_file, tmp_path: Path) -> None:
     root = tmp_path / "state"
     first, second = make_file(), make_file(0.001)
     install(first, root)
@@ -63,7 +63,7 @@ def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: igno
     assert (root / "calibrations/current").is_symlink()
 
 
-def test_what_undoes_an_install_is_named_and_works(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_what_undoes_an_install_is_named_and_works(make_file, tmp_path: Path) -> None:
     """The first has none before it: it is withdrawn. Every later one is rolled back."""
     root = tmp_path / "a state"
     with raises("nothing-installed", InstallError):
@@ -93,7 +93,7 @@ def test_what_undoes_an_install_is_named_and_works(make_file, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("source", ["simulated", "playback", "imported"])
-def test_nothing_unreal_installs_on_a_real_cell_whatever_the_reason(  # type: ignore[no-untyped-def]
+def test_nothing_unreal_installs_on_a_real_cell_whatever_the_reason(
     make_file, tmp_path: Path, source: str
 ) -> None:
     path = make_file(source=source)
@@ -102,7 +102,7 @@ def test_nothing_unreal_installs_on_a_real_cell_whatever_the_reason(  # type: ig
     assert not (tmp_path / "s/calibrations/current").exists()
 
 
-def test_kinds_of_cells_do_not_mix(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_kinds_of_cells_do_not_mix(make_file, tmp_path: Path) -> None:
     root = tmp_path / "s"
     install(make_file(), root)
     with raises("other-cell", InstallError, source="simulated", cell="real"):
@@ -110,13 +110,13 @@ def test_kinds_of_cells_do_not_mix(make_file, tmp_path: Path) -> None:  # type: 
     simulated = tmp_path / "simulated"
     install(make_file(source="simulated"), simulated, cell="simulated")
     with raises("choice", UsageError, given="reel"):
-        install(make_file(), root, cell="reel")  # type: ignore[arg-type]
+        install(make_file(), root, cell="reel")
     with raises("not-real", InstallError, source="simulated"):
         load_installed(simulated)
     assert load_installed(simulated, allow_simulated=True).source == "simulated"
 
 
-def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type: ignore[no-untyped-def]
+def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(
     make_file, solved_real: SolvedRecording, tmp_path: Path
 ) -> None:
     bad = Gate("holdout_share", False, 0.1, 0.005, "predicted to 100 mm")
@@ -130,14 +130,13 @@ def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type:
         install(path, tmp_path / "s", override="x")
     install(path, tmp_path / "s", override="line is down, checked with a pointer")
     override = installed_calibration(tmp_path / "s").override
-    assert override is not None
     assert override.reason == "line is down, checked with a pointer"
     assert "holdout_share" in override.overridden[0]
 
 
 def test_another_robot_camera_or_mount_is_refused(
     make_file, solved_real: SolvedRecording, tmp_path: Path
-) -> None:  # type: ignore[no-untyped-def]
+) -> None:
     """Fault 47."""
     root = tmp_path / "s"
     install(make_file(), root)
@@ -155,7 +154,7 @@ def test_another_robot_camera_or_mount_is_refused(
 
 
 @pytest.mark.parametrize("versions", [1, 2])
-def test_a_damaged_current_file_is_an_objection_and_the_one_before_is_compared(  # type: ignore[no-untyped-def]
+def test_a_damaged_current_file_is_an_objection_and_the_one_before_is_compared(
     make_file, solved_real: SolvedRecording, tmp_path: Path, versions: int
 ) -> None:
     root = tmp_path / "s"
@@ -173,7 +172,7 @@ def test_a_damaged_current_file_is_an_objection_and_the_one_before_is_compared( 
     )
 
 
-def test_an_unwritable_place_is_said(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_an_unwritable_place_is_said(make_file, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with raises("state-folder", InstallError):
         install(make_file(), tmp_path / "file")
@@ -204,9 +203,7 @@ _SYSCALLS = "openat,write,fsync,rename,renameat,renameat2,symlink,symlinkat,unli
 @pytest.mark.timeout(300)  # strace stops every system call of a dozen starts of Python
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
 @pytest.mark.parametrize("points", [2, pytest.param(1000, marks=pytest.mark.soak)])
-def test_a_kill_at_any_system_call_leaves_old_or_new(  # type: ignore[no-untyped-def]
-    make_file, tmp_path: Path, points: int
-) -> None:
+def test_a_kill_at_any_system_call_leaves_old_or_new(make_file, tmp_path: Path, points: int) -> None:
     """Fault 46: SIGKILL on entry to file system calls between the first and the last touch of the root."""
     old, new = make_file(), make_file(0.001)
     # A module that is compiled in one run and not in the next would shift the places of its system calls.
@@ -268,7 +265,7 @@ def _touching_calls(new: Path, template: Path, tmp_path: Path) -> list[tuple[str
     return found
 
 
-def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(  # type: ignore[no-untyped-def]
+def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(
     make_file, solved_real: SolvedRecording, tmp_path: Path
 ) -> None:
     def vaguer(times: float) -> dict[str, Any]:
@@ -282,6 +279,5 @@ def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(  # typ
         install(make_file(**vaguer(2.0)), root)
     assert len(installed_versions(root)) == 3
     made = install(make_file(**vaguer(2.0)), root, override="the old lens is broken")
-    assert made.calibration is not None and made.calibration.override is not None
     assert "no_worse" in made.calibration.override.overridden[0]
     assert rollback(root).number == 3

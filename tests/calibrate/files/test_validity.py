@@ -107,7 +107,7 @@ def test_a_line_of_another_shape_is_skipped_and_what_a_later_version_adds_to_one
         file.write('{"state":"withdrawn","reason":{"code":"withdrawn"},' + line + "}\n")
         file.write("[" * 100_000 + "\n")
     assert load_installed(root, require_valid=False).validity.state is (W if kept else V)
-    assert validity_text(installed_versions(root)[0].validity)  # type: ignore[arg-type]
+    assert validity_text(installed_versions(root)[0].validity)
 
 
 def test_what_a_person_withdrew_no_check_brings_back_and_no_rollback_finds(
@@ -137,7 +137,7 @@ def test_what_is_rolled_back_to_is_unverified_or_still_in_doubt(root: Path, make
 
 
 def test_a_missed_corner_puts_it_in_doubt_and_a_met_one_clears_that(root: Path) -> None:
-    assert note_installed(root, [touch(0.1)]).validity.state is V  # type: ignore[union-attr]
+    assert note_installed(root, [touch(0.1)]).validity.state is V
     note_installed(root, [touch(0.1), touch(5.0)])
     found = load_installed(root, require_valid=False)
     assert (found.version, found.validity.state, found.validity.reason.code) == (3, D, "touch-test")
@@ -151,7 +151,7 @@ def test_what_nobody_vouches_for_is_unverified(
 ) -> None:
     path = make_file(source=source, verification=[touch(5.0)] if override else [])
     cell = "imported" if source == "imported" else "real"
-    install(path, tmp_path / "s", cell=cell, override=override)  # type: ignore[arg-type]
+    install(path, tmp_path / "s", cell=cell, override=override)
     assert load_installed(tmp_path / "s").validity.state is U
 
 
@@ -199,10 +199,10 @@ def test_a_check_judges_the_version_that_it_was_made_on(root: Path, make_file: M
 def test_a_state_may_be_given_by_its_name_and_no_other_one(root: Path) -> None:
     proven = load_installed(root).validity.verified
     assert set_validity(root, D, MOVED).verified == proven, "a doubt proves nothing"
-    assert set_validity(root, "valid", MOVED).state is V  # type: ignore[arg-type]
+    assert set_validity(root, "valid", MOVED).state is V
     assert load_installed(root).validity.verified != proven
     with raises("choice", UsageError, given="validd"):
-        set_validity(root, "validd", MOVED)  # type: ignore[arg-type]
+        set_validity(root, "validd", MOVED)
 
 
 def test_nothing_is_made_where_nothing_is_installed(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from tests.codes import raises
 from tests.durability import disk_order
 
 
-def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(  # type: ignore[no-untyped-def]
+def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(
     make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After a power loss at any moment there is the old one or the new one, and its log."""
@@ -42,7 +42,7 @@ def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(  # type: igno
 
 
 @pytest.mark.parametrize("what", ["generation", "current"])
-def test_what_does_not_read_back_as_written_is_not_installed(  # type: ignore[no-untyped-def]
+def test_what_does_not_read_back_as_written_is_not_installed(
     make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """A disk that says yes and keeps something else."""
@@ -67,7 +67,7 @@ def test_what_does_not_read_back_as_written_is_not_installed(  # type: ignore[no
 @pytest.mark.parametrize(
     ("fails", "switched"), [("0002-", False), ("validity.jsonl", False), ("calibrations", True)]
 )
-def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
+def test_a_full_disk_says_what_is_installed_now(
     make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str, switched: bool
 ) -> None:
     """Once the link is there, the switch has been made."""
@@ -77,7 +77,7 @@ def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
         if path.name.startswith(fails):
             raise OSError(28, "No space left on device")
         if path.suffix:
-            (append_line if path.suffix == ".jsonl" else write_atomically)(path, content)  # type: ignore[operator]
+            (append_line if path.suffix == ".jsonl" else write_atomically)(path, content)
 
     for name in ("write_atomically", "append_line"):
         monkeypatch.setattr(f"calibrate.files.versions.{name}", full)
@@ -89,7 +89,7 @@ def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
     assert len(known) == 1 + switched, "what never was in use is no version"
 
 
-def test_files_of_others_beside_the_generations_are_left_alone(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_files_of_others_beside_the_generations_are_left_alone(make_file, tmp_path: Path) -> None:
     root = tmp_path / "s"
     install(make_file(), root)
     (root / "calibrations/gen/0009-notes.yaml").write_text("mine")
@@ -97,7 +97,7 @@ def test_files_of_others_beside_the_generations_are_left_alone(make_file, tmp_pa
     assert install(make_file(0.001), root).number == 2
 
 
-def test_rollback_passes_over_a_damaged_version(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_rollback_passes_over_a_damaged_version(make_file, tmp_path: Path) -> None:
     root = tmp_path / "s"
     for k in range(3):
         install(make_file(0.0001 * k), root)
@@ -115,9 +115,7 @@ def test_rollback_passes_over_a_damaged_version(make_file, tmp_path: Path) -> No
     ]
 
 
-def test_rollback_goes_to_what_was_in_use(  # type: ignore[no-untyped-def]
-    make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rollback_goes_to_what_was_in_use(make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not to a version that somebody went back from, nor to one whose switch a kill prevented."""
     root = tmp_path / "s"
     for k in range(2):
@@ -147,7 +145,7 @@ def test_a_change_is_told_in_millimetres_and_degrees(solved_real: SolvedRecordin
     assert change_text(before, msgspec.structs.replace(after, mount="eye-to-hand", result=fixed)) == ""
 
 
-def test_what_was_configured_for_the_cell_is_held_against_the_file(  # type: ignore[no-untyped-def]
+def test_what_was_configured_for_the_cell_is_held_against_the_file(
     make_file, solved_real: SolvedRecording, tmp_path: Path
 ) -> None:
     robot, camera = solved_real.calibration.robot, solved_real.calibration.camera
@@ -164,7 +162,7 @@ def test_what_was_configured_for_the_cell_is_held_against_the_file(  # type: ign
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can be two operators")
 @pytest.mark.parametrize("umask", [0o022, 0o077])
-def test_two_operators_of_a_group_share_a_folder(make_file, umask: int) -> None:  # type: ignore[no-untyped-def]
+def test_two_operators_of_a_group_share_a_folder(make_file, umask: int) -> None:
     """A folder like /var/lib/station/calibrations: setgid, the group may write."""
     with tempfile.TemporaryDirectory() as place:  # pytest's own folders are for one user
         Path(place).chmod(0o755)

@@ -44,12 +44,10 @@ def solved(worn: Worn) -> Solution:
 
 
 def table_of(solution: Solution) -> ArmResult:
-    assert solution.arm is not None and solution.arm.result is not None
     return solution.arm.result
 
 
 def as_it_is(solution: Solution) -> UncorrectedArm:
-    assert solution.arm is not None and solution.arm.uncorrected is not None
     return solution.arm.uncorrected
 
 
@@ -123,7 +121,7 @@ def test_workspace_derivatives_are_those_of_the_points(mount: str) -> None:
     rng = np.random.default_rng(8)
     joints = rng.uniform(-2, 2, (4, 6))
     X, Y = (pose(random_rotation(rng), 0.3 * rng.normal(size=3)) for _ in range(2))
-    room = Workspace.of(mount, forward(UR10, joints), CHAIN.by_links(joints), X, Y, 0.5)  # type: ignore[arg-type]
+    room = Workspace.of(mount, forward(UR10, joints), CHAIN.by_links(joints), X, Y, 0.5)
     shift, errors = 1e-5 * rng.normal(size=6), 1e-5 * rng.normal(size=30)
     true = CHAIN.with_errors(errors).forward(joints)
     said, wrong = forward(UR10, joints), perturb(X, shift)

@@ -95,15 +95,11 @@ def test_fisheye_and_rational_lenses() -> None:
 def test_undistort_is_the_inverse_of_project(camera: CameraModel) -> None:
     seen = around(1)[0]
     points = board_points(PAPER_BOARD)
-    straight = replace_distortion(camera)
+    straight = CameraModel(camera.width, camera.height, camera.matrix)
     assert (
         np.abs(undistort(camera, project_at(camera, seen, points)) - project_at(straight, seen, points)).max()
         < 1e-5
     )
-
-
-def replace_distortion(camera: CameraModel) -> CameraModel:
-    return CameraModel(camera.width, camera.height, camera.matrix)
 
 
 @pytest.mark.filterwarnings("error")

@@ -81,7 +81,7 @@ def test_one_sure_picture_does_not_decide_for_the_doubtful_ones() -> None:
     while len(views) < 13:
         far = len(views) >= 8
         C = looking(MARKED, rng, (0.1, 0.25) if far else (0.3, 0.6), 4.0 if far else 0.4, np.pi)
-        pixels = project_pixels(CAMERA, _moved(C, points)) + rng.normal(size=(len(points), 2)) * 0.3
+        pixels = project_pixels(CAMERA, transform_points(C, points)) + rng.normal(size=(len(points), 2)) * 0.3
         view = BoardView(len(views), "", P @ inverse(X @ C), points, pixels)
         readings = [found.camera_from_board for found in candidate_poses(view, CAMERA, MARKED)]
         off = [float(rotation_angle(found[:3, :3].T @ C[:3, :3])) for found in readings]
@@ -91,7 +91,3 @@ def test_one_sure_picture_does_not_decide_for_the_doubtful_ones() -> None:
         right.append(readings[int(np.argmin(off))])
     solved = solve_pnp(ViewSet("eye-in-hand", tuple(views), CAMERA), MARKED)
     np.testing.assert_allclose(solved.camera_from_board, right, atol=1e-4)
-
-
-def _moved(camera_from_board: Array, points: Array) -> Array:
-    return transform_points(camera_from_board, points)

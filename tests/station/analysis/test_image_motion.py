@@ -77,8 +77,7 @@ def test_a_board_that_swings_before_a_resting_wall_is_seen_where_it_should_be() 
 
 async def recorded(rig: Rig) -> list[float | None]:
     """Image motion of every pose of a whole session."""
-    await rig.give_go()
-    await rig.until(S.IDLE, S.PAUSED, S.FAULT)
+    await rig.go_until(S.IDLE, S.PAUSED, S.FAULT)
     views = open_recording(Path(rig.session.store.status.session.recording)).views()
     return [view.stillness.image_motion_px for view in views if view.stillness is not None]
 
@@ -90,8 +89,7 @@ async def test_every_pose_is_recorded_with_its_pictures_motion(rig: Rig) -> None
 
 async def test_a_moving_picture_is_not_captured_although_the_joints_rest(rig: Rig) -> None:
     rig.camera.jumps = 3
-    await rig.give_go()
-    await rig.until(S.PAUSED)
+    await rig.go_until(S.PAUSED)
     assert rig.camera.taken == 0 and "done" not in rig.pose_states
     reason = rig.session.store.status.session.poses[0].reason
     assert "the image moves by 23.48 px (limit 0.30)" in reason
@@ -120,8 +118,7 @@ async def test_one_bad_glimpse_is_looked_at_again(rig: Rig) -> None:
 
 async def test_stop_leaves_the_camera_free(rig: Rig) -> None:
     rig.camera.jumps = 3
-    await rig.give_go()
-    await rig.until(S.SETTLING)
+    await rig.go_until(S.SETTLING)
     await rig.session.stop("bert")
     seen_before = rig.camera.glimpses
     await asyncio.sleep(0.1)

@@ -63,6 +63,6 @@ def test_never_tested_failed_and_unreadable_are_not_accepted(tmp_path: Path) -> 
 def test_a_file_of_the_eight_ways_and_stages_is_still_read(tmp_path: Path) -> None:
     figure = {"name": "moved", "value": 0.0, "unit": "rad", "limit": 0.001, "source": "", "least": False}
     result = {"way": "slider", "speed_m_s": 0.03, "figures": [figure], "repeated": 0}
-    old = msgspec.to_builtins(PASSED) | {"results": [result], "report": "/root/acceptance.html"}
+    old = msgspec.to_builtins(PASSED) | {"results": [result], "report": "/var/lib/station/acceptance.html"}
     (tmp_path / ACCEPTANCE_NAME).write_bytes(msgspec.json.encode(old))
     assert not not_accepted(read_acceptance(tmp_path), SUBJECT, 0.25)

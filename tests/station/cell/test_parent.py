@@ -35,7 +35,6 @@ def gone(pid: int) -> bool:
 def test_a_stopped_child_dies_with_its_killed_parent() -> None:
     """It reads nothing and answers nothing: only the kernel can end it."""
     with subprocess.Popen([sys.executable, "-c", PARENT, CHILD], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
         child = int(parent.stdout.readline())
         try:
             os.kill(child, signal.SIGSTOP)

@@ -15,7 +15,7 @@ from station.cell.errors import StaleStateError
 from station.cell.layout import pose_vector
 from station.cell.stillness import NotStillError, StillnessMonitor
 from tests.codes import raises
-from tests.station.devices.test_ur_moves import STATE
+from tests.recordings.small_recording import PLAYING
 
 HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 
@@ -24,7 +24,7 @@ def state(at_s: float, joint_rad: float = 0.0, speed_rad_s: float = 0.0) -> Robo
     """Joint 2 displaced and moving."""
     joints = (HOME[0], HOME[1] + joint_rad, *HOME[2:])
     return msgspec.structs.replace(
-        STATE,
+        PLAYING,
         stamps=Stamps(controller_s=at_s),
         joints_rad=joints,
         tcp_pose=pose_vector(forward(MODELS["UR10"], joints)),
@@ -58,7 +58,6 @@ def test_a_shaking_arm_is_measured() -> None:
     m = monitor()
     shake(m, 0.5, 0.001)
     found = m.measure()
-    assert found is not None
     assert found.max_joint_speed_rad_s == pytest.approx(0.001 * 2 * math.pi * 8, rel=0.02)
     radius_m = math.hypot(0.5723 + 0.1157, 0.612)  # of the flange about the shoulder, roughly
     assert found.position_scatter_m == pytest.approx(0.001 * radius_m, rel=0.5)
@@ -101,7 +100,6 @@ def test_flange_and_picture_have_a_say(measured: dict[str, float], said: str) ->
     m = monitor()
     shake(m, 0.5, 0.0)
     found = m.measure()
-    assert found is not None
     assert m.unrest(msgspec.structs.replace(found, **measured)) == said
 
 
@@ -158,7 +156,7 @@ async def test_an_arm_that_never_rests_is_given_up_with_the_reason(
         await m.settle(lambda: alive, lambda since_ns: looked, now_s=lambda: next(clock))
     if shaken_rad:
         assert "shoulder" in told.value.text
-        assert float(told.value.values["max_joint_speed_rad_s"]) > 0.1  # type: ignore[arg-type]
+        assert float(told.value.values["max_joint_speed_rad_s"]) > 0.1
 
 
 async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:

@@ -115,7 +115,7 @@ async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFi
         async def call(self, verb: object, *, timeout_s: float) -> None:
             raise StationError("request-unanswered", verb="stop", timeout_s=timeout_s)
 
-    await session.stop_and_say(Hanging())  # type: ignore[arg-type]
+    await session.stop_and_say(Hanging())
     said = capsys.readouterr().err
     assert "emergency stop" in said
 

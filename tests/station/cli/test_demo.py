@@ -49,7 +49,7 @@ def test_a_solve_that_failed_says_why(tmp_path: Path) -> None:
 
 
 def test_a_demo_that_stops_on_the_way_says_where_its_poses_are() -> None:
-    session = SessionStatus(name="s-1", folder="/root/s-1", captured=9, poses=(PoseStatus(0, "p01"),) * 25)
+    session = SessionStatus(name="s-1", folder="/data/s-1", captured=9, poses=(PoseStatus(0, "p01"),) * 25)
     with raises("demo-unfinished", captured=9, poses=25) as failed:
         _solved(StationStatus(StationState.FAULT, "no news from the robot", session=session))
-    assert "/root/s-1" in str(failed.value) and failed.value.remedy
+    assert "/data/s-1" in str(failed.value) and failed.value.remedy

@@ -93,7 +93,7 @@ class Device:
 def opened(device: Device, config: CameraConfig) -> AravisCamera:
     camera: Any = AravisCamera(config)
     camera._device = device
-    return camera  # type: ignore[no-any-return]
+    return camera
 
 
 async def test_a_frame_that_nobody_asked_for_costs_the_pose_not_the_next() -> None:

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from station.cell.clock_fit import ClockFit
 from station.devices.clocks import ClockEstimator, monotonic_from_wall_ns
 
 OFFSET_NS = 5_000_000_000_000
@@ -36,12 +35,6 @@ def host_ns(device_s: float, drift_ppm: float) -> int:
     return round(device_s * 1e9 * (1 + drift_ppm * 1e-6)) + OFFSET_NS
 
 
-def fit(clock: ClockEstimator) -> ClockFit:
-    found = clock.fit()
-    assert found is not None
-    return found
-
-
 @settings(max_examples=25)
 @given(
     drift_ppm=st.floats(-100, 100),
@@ -54,7 +47,7 @@ def test_times_are_right_within_the_bound(
 ) -> None:
     clock = ClockEstimator()
     first, last = feed(clock, seconds, 125, drift_ppm, delay_s, seed)
-    found = fit(clock)
+    found = clock.fit()
     for device_s in (first, (first + last) / 2, last):
         error_s = abs(found.to_host_ns(device_s) - host_ns(device_s, drift_ppm)) / 1e9
         assert error_s <= found.bound_at(device_s) + 1e-7
@@ -67,7 +60,7 @@ def test_a_few_late_arrivals_change_nothing() -> None:
         device_s, late_ns = i * 0.002, 200_000_000 if i % 50 == 0 else 0
         clean.add(device_s, host_ns(device_s, 0))
         disturbed.add(device_s, host_ns(device_s, 0) + late_ns)
-    assert fit(disturbed).to_host_ns(9.0) == pytest.approx(fit(clean).to_host_ns(9.0), abs=1000)
+    assert disturbed.fit().to_host_ns(9.0) == pytest.approx(clean.fit().to_host_ns(9.0), abs=1000)
 
 
 def test_nothing_is_claimed_too_early() -> None:
@@ -81,8 +74,8 @@ def test_nothing_is_claimed_too_early() -> None:
 def test_what_is_known_of_the_latency_widens_the_bound() -> None:
     clock = ClockEstimator()
     feed(clock, 10, 125, 0.0, 0.0005, seed=3)
-    before_s, clock.latency_s = fit(clock).bound_s, 0.004
-    assert fit(clock).bound_s == pytest.approx(before_s + 0.004)
+    before_s, clock.latency_s = clock.fit().bound_s, 0.004
+    assert clock.fit().bound_s == pytest.approx(before_s + 0.004)
 
 
 def test_a_device_that_restarts_starts_afresh() -> None:
@@ -90,7 +83,7 @@ def test_a_device_that_restarts_starts_afresh() -> None:
     feed(clock, 10, 125, 0.0, 0.0005, seed=4, start_s=1000.0)
     for i in range(20):
         clock.add(i * 0.008, 77_000_000_000 + i * 8_000_000)
-    assert fit(clock).to_host_ns(0.1) == pytest.approx(77_100_000_000, abs=2_000_000)
+    assert clock.fit().to_host_ns(0.1) == pytest.approx(77_100_000_000, abs=2_000_000)
 
 
 def test_old_arrivals_are_forgotten() -> None:
@@ -99,7 +92,7 @@ def test_old_arrivals_are_forgotten() -> None:
     _, last = feed(clock, 10, 125, 0.0, 0.0002, seed=5)
     for i in range(40 * 125):
         clock.add(last + i / 125, host_ns(last + i / 125, 0.0) + 9_000_000)
-    assert fit(clock).to_host_ns(last) == host_ns(last, 0.0) + 9_000_000
+    assert clock.fit().to_host_ns(last) == host_ns(last, 0.0) + 9_000_000
 
 
 @pytest.mark.parametrize("held_up_ns", [0, 5_000_000])

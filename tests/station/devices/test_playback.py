@@ -16,11 +16,9 @@ from calibrate.kinematics import MODELS, forward
 from recordings.images import encode_png
 from recordings.schema.messages import (
     CameraIdentity,
-    CameraModel,
     Image,
     RobotIdentity,
     RobotState,
-    SessionInfo,
     Stamps,
     View,
 )
@@ -31,6 +29,7 @@ from station.cli.serve import serve_command
 from station.devices.playback import PlaybackCamera, PlaybackRobot, playback_cell
 from tests.codes import raises
 from tests.patience import until
+from tests.recordings.small_recording import make_info
 
 STARTS = [(0.1 * i, -1.5, -1.5, -1.6, 1.57, 0.2 * i) for i in range(3)]
 TCP = (0.0, 0.0, 0.1, 0.0, 0.0, 0.3)
@@ -47,12 +46,8 @@ def recording(tmp_path: Path) -> Path:
 
 def record(path: Path, *, joints: bool, cut: int | None = None, config: bytes | None = None) -> Path:
     """`cut`: this picture's file lacks its end."""
-    info = SessionInfo(
+    info = make_info(
         name="session",
-        mount="eye-in-hand",
-        source="simulated",
-        board=PAPER_BOARD,
-        camera=CameraModel(32, 24),
         robot=RobotIdentity(model="UR10", serial="R1", tcp_offset=TCP),
         camera_identity=CameraIdentity("Daheng Imaging", "MER-131-75GM", "KJ1", "rendered"),
     )

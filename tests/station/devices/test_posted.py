@@ -339,7 +339,6 @@ async def test_typed_numbers_count_for_a_while_only_as_the_arm_then_moves_on(arm
     typing = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "station.cli", *words, stdin=asyncio.subprocess.PIPE
     )
-    assert typing.stdin is not None
     typing.stdin.write(b"1 2 3\nX 400.0, Y -200.0, Z 300.0, A 0, B 0, C 0\n")
     await until(lambda: states)
     assert states[0].tcp_pose == pytest.approx((0.4, -0.2, 0.3, 0.0, 0.0, 0.0))

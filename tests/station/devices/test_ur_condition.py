@@ -10,7 +10,7 @@ import pytest
 from recordings.schema.messages import RobotState
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 from station.devices.ur_condition import arm_held, control_ended, foreign_program
-from tests.station.devices.test_ur_moves import STATE
+from tests.recordings.small_recording import PLAYING
 
 SAFETY = {
     None: (1, 2),
@@ -26,7 +26,7 @@ BITS = SafetyStatus.STOPPED_DUE_TO_SAFETY | SafetyStatus.PROTECTIVE_STOPPED
 
 
 def now(**how: Any) -> RobotState:
-    return msgspec.structs.replace(STATE, **how)
+    return msgspec.structs.replace(PLAYING, **how)
 
 
 def code(state: RobotState) -> str | None:

@@ -10,7 +10,7 @@ from recordings.schema.messages import RobotState, Stamps
 from station.cell.clock_fit import ClockFit
 from station.devices.history import state_at
 from tests.codes import raises
-from tests.station.devices.test_ur_moves import STATE
+from tests.recordings.small_recording import PLAYING
 
 HOST_S, WALL_S = 500.0, 9_000.0
 """What the host's two clocks showed when the controller's showed 0."""
@@ -22,7 +22,7 @@ def sample(at_s: float) -> RobotState:
     """Joint 1 turns by 0.5 rad/s; the tool goes along y by 0.1 m/s and turns about AXIS by 0.2 rad/s."""
     turn = (0.2 * at_s * AXIS).tolist()
     return msgspec.structs.replace(
-        STATE,
+        PLAYING,
         stamps=Stamps(round((at_s + HOST_S) * 1e9), round((at_s + WALL_S) * 1e9), at_s),
         joints_rad=(0.5 * at_s, 1.0, 0.0, 0.0, 0.0, 0.0),
         joint_speeds_rad_s=(0.5 * at_s, 0.0, 0.0, 0.0, 0.0, 0.0),

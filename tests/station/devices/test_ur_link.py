@@ -18,7 +18,7 @@ from station.devices.rtde import HEADER, PORT, PacketType, packet
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import Found, RobotLock
 from tests.codes import raises
-from tests.station.devices.test_ur_moves import STATE
+from tests.recordings.small_recording import PLAYING
 
 CONFIG = RobotConfig(model="UR10", host="127.0.0.1", serial="2016")
 
@@ -37,8 +37,8 @@ def test_a_listener_that_fails_is_dropped_alone(link: Any) -> None:
 
     for listener in (lambda state: heard.append("first"), fails, lambda state: heard.append("last")):
         link.subscribe(listener)
-    link._deliver(STATE)
-    link._deliver(STATE)
+    link._deliver(PLAYING)
+    link._deliver(PLAYING)
     assert heard == ["first", "fails", "last", "first", "last"]
 
 
@@ -83,7 +83,7 @@ async def test_a_dashboard_that_is_gone_is_opened_again(link: Any, dead: Any) ->
 
 async def test_a_robot_that_cannot_be_asked_for_is_named(tmp_path: Path) -> None:
     with raises("unknown-robot-model"):
-        UrLink(RobotConfig(model="UR7", host="127.0.0.1"))  # type: ignore[arg-type]
+        UrLink(RobotConfig(model="UR7", host="127.0.0.1"))
     with raises("no-host"):
         await UrLink(RobotConfig(model="UR10", host="")).connect()
 

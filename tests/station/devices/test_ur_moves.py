@@ -7,35 +7,22 @@ from typing import Any
 import msgspec
 import pytest
 
-from recordings.schema.messages import RobotState, Stamps, Vector6
+from recordings.schema.messages import RobotState, Vector6
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 from station.devices.ur_moves import MoveWatch, check_goal
 from tests.codes import raises
+from tests.recordings.small_recording import PLAYING
 
 START = (0.0,) * 6
 GOAL = (0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
 BEFORE = 3 << 24
 RUNNING = 4 << 24 | 1 << 15
 ENDED = 4 << 24
-STATE = RobotState(
-    stamps=Stamps(),
-    joints_rad=START,
-    joint_speeds_rad_s=(0.0,) * 6,
-    target_joints_rad=START,
-    tcp_pose=(0.0,) * 6,
-    robot_mode=RobotMode.RUNNING,
-    safety_mode=SafetyMode.NORMAL,
-    safety_status_bits=SafetyStatus.NORMAL,
-    runtime_state=RuntimeState.PLAYING,
-    robot_status_bits=3,
-    speed_scaling=1.0,
-    target_speed_fraction=1.0,
-)
 
 
 def state(joint_rad: float = 0.0, **changes: Any) -> RobotState:
     where = {"joints_rad": (joint_rad, 0.0, 0.0, 0.0, 0.0, 0.0)}
-    return msgspec.structs.replace(STATE, **(where | changes))
+    return msgspec.structs.replace(PLAYING, **(where | changes))
 
 
 @pytest.fixture

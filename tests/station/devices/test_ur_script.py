@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from station.cell.errors import RobotError
-from station.devices.rtde import RuntimeState
 from station.devices.ur_control import WATCHDOG_HZ
 from station.devices.ur_moves import JOINT_SPEED_LIMIT_RAD_S
 from station.devices.ur_script import (
@@ -23,13 +22,12 @@ from station.devices.ur_script import (
     State,
     script,
 )
-from station.simulation.controller.robot import SimulatedRobot
-from station.simulation.controller.state import Journal, Settings
 from station.simulation.controller.uploads import Upload
 from station.simulation.controller.urscript import ScriptRun
 from station.simulation.controller.urscript_parser import ScriptSyntaxError
 from station.simulation.launch import AdminClient, SimulatedController
 from tests.patience import wait_until
+from tests.station.simulation.conftest import SteppedRobot
 
 HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 GOAL = (0.6, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
@@ -58,13 +56,13 @@ def test_the_script_waits_as_long_as_the_watchdog_would() -> None:
 # -- the script alone, cycle by cycle -------------------------------------------------------------------
 
 
-class Registers:
+class Registers(SteppedRobot):
     """A controller in which the script runs; packets are written by hand."""
 
     def __init__(
         self, left_by_others: int = SEQUENCE, verb: Command = Command.NONE, model: str = "UR10"
     ) -> None:
-        self.robot = SimulatedRobot(Settings(model=model, start_joints_rad=HOME), Journal())
+        super().__init__(model=model, start_joints_rad=HOME)
         self.sequence, self.keepalive = left_by_others, 5
         self.verb, self.numbers = verb, (0.0,) * 8
         self.packet()
@@ -82,14 +80,14 @@ class Registers:
         for _ in range(round(seconds / self.robot.dt_s)):
             self.keepalive += kick
             self.packet()
-            self.robot.tick(self.robot.ticks * 8_000_000)
+            super().run(self.robot.dt_s)
 
     def say(
         self, verb: int, goal: tuple[float, ...] = GOAL, speed: float = 0.5, acceleration: float = 1.0
     ) -> int:
         """The script's answer: 1 taken, -1 refused, 0 nothing."""
         self.sequence += 1
-        self.verb, self.numbers = verb, (*goal, speed, acceleration)  # type: ignore[assignment]
+        self.verb, self.numbers = verb, (*goal, speed, acceleration)
         self.run(0.03)
         answer = self.robot.outputs.get(f"output_int_register_{FIRST_REGISTER}")
         return (answer == self.sequence) - (answer == -self.sequence)
@@ -101,14 +99,6 @@ class Registers:
     @property
     def word(self) -> int:
         return int(self.robot.outputs.get("output_int_register_2"))
-
-    @property
-    def plays(self) -> bool:
-        return self.robot.runtime_state == RuntimeState.PLAYING
-
-    @property
-    def speed_rad_s(self) -> float:
-        return max(map(abs, self.robot.arm.command_speed))
 
 
 def cruising(model: str = "UR10") -> Registers:
@@ -279,7 +269,7 @@ def test_a_move_that_a_paused_script_did_not_answer_is_not_made_when_it_goes_on(
     assert control.setWatchdog(WATCHDOG_HZ) and control.kickWatchdog()
     before = admin.ask("state")["joints_rad"]
     control._told_s = float("inf")  # the pause is not seen yet
-    control._plays = lambda: True  # type: ignore[method-assign]
+    control._plays = lambda: True
     admin.ask("pause")
     assert not control.moveJ(GOAL, 0.5, 1.0, True)
     admin.ask("play")

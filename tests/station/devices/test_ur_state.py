@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
+import os
+import signal
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from itertools import pairwise
@@ -13,8 +16,9 @@ import pytest
 from recordings.schema.messages import RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import StationError
+from station.devices.rtde import RobotMode
 from station.devices.ur_link import UrLink
-from station.devices.ur_state import StateReader
+from station.devices.ur_state import Sample, StateReader
 from station.simulation.launch import AdminClient, SimulatedController
 from tests.codes import raises
 from tests.patience import until
@@ -29,7 +33,15 @@ class Stream:
         self.running = running
         self.states: list[RobotState] = []
         self.ends: list[str] = []
-        self.reader = StateReader(running.host, self.states.append, self.ends.append)
+        self.reader = self._new()
+
+    def _new(self) -> StateReader:
+        return StateReader(self.running.host, self.states.append, self.ends.append)
+
+    async def again(self) -> Sample:
+        """The first sample of a new connection."""
+        self.reader = self._new()
+        return await self.reader.open()
 
 
 Follow = Callable[..., Awaitable[Stream]]
@@ -73,6 +85,51 @@ async def test_every_sample_comes_once_in_order_with_the_time_of_the_controller(
     assert min(delays) > -1e-4 and sorted(delays)[len(delays) // 2] < 0.02
     gaps = [x.stamps.host_wall_ns - x.stamps.host_monotonic_ns for x in states]
     assert max(gaps) - min(gaps) < 5_000_000
+
+
+async def test_truth_is_where_the_arm_was_at_that_host_time(stream: Follow) -> None:
+    """By the admin port of the simulator, which other tests compare with."""
+    s = await stream("UR10e")
+    with s.running.admin() as admin:
+        admin.ask("hand_move", joints=[1.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0], speed_rad_s=1.0)
+        await until(lambda: s.states[-1].joints_rad[0] > 0.9)
+        zero_ns = admin.ask("state")["controller_zero_monotonic_ns"]
+        moving = [state for state in s.states if 0.1 < state.joints_rad[0] < 0.9]
+        assert len(moving) > 100
+        for state in moving[::20]:
+            at_ns = zero_ns + round(state.stamps.controller_s * 1e9)
+            truth = admin.ask("truth", at_monotonic_ns=at_ns)
+            assert truth["joints_rad"] == pytest.approx(state.joints_rad, abs=1e-9)
+            between = admin.ask("truth", at_monotonic_ns=at_ns + 1_000_000)
+            assert between["joints_rad"][0] > state.joints_rad[0]
+        soon_ns = time.monotonic_ns() + 100_000_000
+        assert admin.ask("truth", at_monotonic_ns=soon_ns)["at_monotonic_ns"] == soon_ns
+        assert time.monotonic_ns() >= soon_ns
+        with raises("simulation-refused"):
+            admin.ask("truth", at_monotonic_ns=1)
+
+
+async def test_a_reboot_ends_the_link_and_starts_at_time_zero(stream: Follow) -> None:
+    s = await stream()
+    before_s = s.states[-1].stamps.controller_s
+    with s.running.admin() as admin:
+        admin.ask("restart", down_s=0.4)
+    await until(lambda: s.ends)
+    again = None
+    while again is None:
+        with contextlib.suppress(StationError):
+            again = (await s.again()).state
+    assert again.stamps.controller_s < before_s + 0.35 and again.robot_mode == RobotMode.POWER_OFF
+
+
+async def test_cycles_that_a_held_up_controller_makes_late_come_all_and_in_order(stream: Follow) -> None:
+    s = await stream("UR10e")
+    os.kill(s.running.process.pid, signal.SIGSTOP)
+    await asyncio.sleep(0.2)
+    os.kill(s.running.process.pid, signal.SIGCONT)
+    await until(lambda: len(s.states) > 300)
+    steps_s = [b.stamps.controller_s - a.stamps.controller_s for a, b in pairwise(s.states)]
+    assert steps_s == pytest.approx([0.002] * len(steps_s), abs=1e-9)
 
 
 async def test_frozen_data_are_no_samples(stream: Follow) -> None:
@@ -138,7 +195,6 @@ async def test_the_pose_at_a_moment(link: UrLink) -> None:
         found = link.at(asked_ns)
         truth = admin.ask("truth", at_monotonic_ns=asked_ns)
     fit = link.clock()
-    assert fit is not None
     bound_rad = 0.8 * fit.bound_s + 1e-4
     assert abs(found.joints_rad[0] - truth["joints_rad"][0]) < bound_rad
     assert math.dist(found.tcp_pose[:3], [row[3] for row in truth["base_from_flange"][:3]]) < bound_rad * 1.5

@@ -89,5 +89,5 @@ def test_one_slow_answer_at_the_start_bounds_no_time(
         def start(self) -> None: ...
 
     monkeypatch.setattr(time, "perf_counter", lambda: now_s)
-    reader._handshake(Link())  # type: ignore[arg-type]
+    reader._handshake(Link())
     assert reader.clock.latency_s == pytest.approx(0.0003) and next(trips_s) == 0.05

@@ -14,6 +14,7 @@ from station.simulation.controller.primary import state
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
 from tests.codes import raises
+from tests.recordings.small_recording import PLAYING
 
 UR10 = MODELS["UR10"]
 NO_TOOL: Vector6 = (0.0,) * 6
@@ -29,23 +30,58 @@ def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
     """Give what a controller with this arm reports."""
     T = forward(arm, joints_rad) @ pose_from_rotvec(tool[:3], tool[3:])
     pose = tuple(np.concatenate([T[:3, 3], rotation_log(T[:3, :3])]).tolist())
-    fields = dict.fromkeys(RobotState.__struct_fields__, 0)
-    return msgspec.convert(
-        fields
-        | {"stamps": {}, "joints_rad": joints_rad, "tcp_pose": pose}
-        | dict.fromkeys(("joint_speeds_rad_s", "target_joints_rad"), NO_TOOL),
-        RobotState,
-    )
+    return msgspec.structs.replace(PLAYING, joints_rad=joints_rad, tcp_pose=pose)
 
 
 def stated(arm: RobotModel, tool: Vector6) -> Installation:
-    return Installation(tool, (arm.theta_rad, arm.a_m, arm.d_m, arm.alpha_rad))  # type: ignore[arg-type]
+    return Installation(tool, (arm.theta_rad, arm.a_m, arm.d_m, arm.alpha_rad))
 
 
-def test_the_controllers_words_are_taken_when_they_fit() -> None:
-    check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), stated(UR10, TOOL))
-    assert check.offset == TOOL
-    check.check(sample(UR10, THERE, TOOL), stated(UR10, TOOL))
+@pytest.mark.parametrize(
+    ("arm", "table", "told", "changes"),
+    [
+        (UR10, UR10, True, ((0, 0.001), (5, 0.003))),
+        (FACTORY, UR10, True, ((0, 0.001),)),
+        (UR10, UR10, False, ((0, 0.015), (5, 0.03))),
+        (FACTORY, UR10, False, ((0, 0.015),)),
+        (FACTORY, FACTORY, False, ((0, 0.001), (5, 0.003))),
+    ],
+    ids=["as published", "factory calibration", "published, untold: coarse", "untold: coarse", "configured"],
+)
+def test_a_tool_is_found_and_its_change_noticed(
+    arm: RobotModel, table: RobotModel, told: bool, changes: tuple[tuple[int, float], ...]
+) -> None:
+    words = stated(arm, TOOL) if told else Installation()
+    check = TcpCheck(table, table is FACTORY, sample(arm, HERE, TOOL), words)
+    if told or arm is table:
+        assert check.offset == pytest.approx(TOOL, abs=1e-9)
+    check.check(sample(arm, THERE, TOOL), words)
+    for number, by in changes:
+        moved = [*TOOL]
+        moved[number] += by
+        with raises("tcp-changed"):
+            check.check(sample(arm, THERE, tuple(moved)), words)
+
+
+LONG: Vector6 = (0.0, 0.0, 1.05, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("arm", "tool", "words", "code"),
+    [
+        ("UR5", TOOL, stated(MODELS["UR5"], TOOL), "other-kinematics"),
+        ("UR10e", TOOL, stated(MODELS["UR10e"], TOOL), "other-kinematics"),
+        ("UR5", TOOL, Installation(TOOL), "tcp-mismatch"),
+        ("UR10e", TOOL, Installation(TOOL), "tcp-mismatch"),
+        ("UR10", TOOL, Installation(NO_TOOL), "tcp-mismatch"),
+        ("UR10", LONG, stated(UR10, LONG), "tcp-too-far"),
+    ],
+)
+def test_another_arm_or_tool_than_stated_is_noticed(
+    arm: str, tool: Vector6, words: Installation, code: str
+) -> None:
+    with raises(code):
+        TcpCheck(UR10, False, sample(MODELS[arm], HERE, tool), words)
 
 
 def test_the_factory_calibration_is_told_where_it_explains_the_poses() -> None:
@@ -61,56 +97,6 @@ def test_the_factory_calibration_is_told_where_it_explains_the_poses() -> None:
     assert configured is not None and configured.source == "configuration"
 
 
-def test_without_words_the_offset_is_derived() -> None:
-    check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation())
-    assert check.offset == pytest.approx(TOOL, abs=1e-9)
-
-
-@pytest.mark.parametrize("arm", ["UR5", "UR10e"])
-def test_the_wrong_model_is_noticed(arm: str) -> None:
-    with raises("other-kinematics"):
-        TcpCheck(UR10, False, sample(MODELS[arm], HERE, TOOL), stated(MODELS[arm], TOOL))
-    with raises("tcp-mismatch"):
-        TcpCheck(UR10, False, sample(MODELS[arm], HERE, TOOL), Installation(TOOL))
-
-
-def test_a_tool_that_is_not_the_stated_one_is_noticed() -> None:
-    with raises("tcp-mismatch"):
-        TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation(NO_TOOL))
-
-
-def test_factory_calibration_is_no_mix_up_and_makes_the_check_fine() -> None:
-    arm = FACTORY
-    check = TcpCheck(UR10, False, sample(arm, HERE, TOOL), stated(arm, TOOL))
-    check.check(sample(arm, THERE, TOOL), stated(arm, TOOL))
-    moved = (TOOL[0] + 0.001, *TOOL[1:])
-    with raises("tcp-changed"):
-        check.check(sample(arm, THERE, moved), stated(arm, TOOL))
-
-
-def test_with_the_nominal_table_alone_the_check_is_coarse_but_there() -> None:
-    arm = FACTORY
-    check = TcpCheck(UR10, False, sample(arm, HERE, TOOL), Installation())
-    check.check(sample(arm, THERE, TOOL), Installation())
-    with raises("tcp-changed"):
-        check.check(sample(arm, THERE, (TOOL[0] + 0.015, *TOOL[1:])), Installation())
-
-
-def test_the_coarse_check_sees_a_turned_tool_too() -> None:
-    check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation())
-    with raises("tcp-changed"):
-        check.check(sample(UR10, HERE, (*TOOL[:5], TOOL[5] + 0.03)), Installation())
-
-
-def test_with_a_configured_table_the_check_is_fine_without_the_controllers_words() -> None:
-    arm = FACTORY
-    check = TcpCheck(arm, True, sample(arm, HERE, TOOL), Installation())
-    check.check(sample(arm, THERE, TOOL), Installation())
-    for moved in ((TOOL[0] + 0.001, *TOOL[1:]), (*TOOL[:5], TOOL[5] + 0.003)):
-        with raises("tcp-changed"):
-            check.check(sample(arm, THERE, moved), Installation())
-
-
 def test_in_motion_joints_and_pose_of_neighbouring_cycles_are_no_change_but_another_tool_is() -> None:
     check = TcpCheck(FACTORY, True, sample(FACTORY, HERE, TOOL), Installation())
     speeds: Vector6 = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -122,12 +108,6 @@ def test_in_motion_joints_and_pose_of_neighbouring_cycles_are_no_change_but_anot
     moved = sample(FACTORY, HERE, (TOOL[0] + 0.08, *TOOL[1:]))
     with raises("tcp-changed"):
         check.check(msgspec.structs.replace(moved, joint_speeds_rad_s=speeds), Installation())
-
-
-def test_a_tool_of_more_than_a_metre_is_a_mix_up() -> None:
-    long: Vector6 = (0.0, 0.0, 1.05, 0.0, 0.0, 0.0)
-    with raises("tcp-too-far"):
-        TcpCheck(UR10, False, sample(UR10, HERE, long), stated(UR10, long))
 
 
 def test_a_changed_statement_is_noticed_before_the_arm_shows_it() -> None:

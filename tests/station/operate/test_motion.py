@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import pytest
@@ -14,7 +14,6 @@ from station.cell.errors import LimitError, RefusedError, StationError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import CameraStatus, MotionPreview, RobotStatus, StationState, StationStatus
 from station.operate import motion
-from station.protocol.client import Client
 from station.protocol.verbs import PLANNED_ELSEWHERE, Done, GetPlan, LoadedPlan, MakePlan, Prepare, Purpose
 from tests.recordings.small_recording import make_state
 
@@ -35,7 +34,7 @@ class Telling:
 
 
 def waited(*told: StationStatus) -> StationStatus:
-    return asyncio.run(motion.wait_until_idle(cast("Client", Telling(*told))))
+    return asyncio.run(motion.wait_until_idle(Telling(*told)))
 
 
 def idle(**fields: Any) -> StationStatus:
@@ -94,8 +93,7 @@ def test_only_a_plan_of_default_poses_is_made_again(criterion: Any) -> None:
         return True
 
     def started(link: Elsewhere) -> bool:
-        begun = motion.prepared_motion(cast("motion.Client", link), Prepare(Purpose.RUN), yes, plans_here=yes)
-        return asyncio.run(begun)
+        return asyncio.run(motion.prepared_motion(link, Prepare(Purpose.RUN), yes, plans_here=yes))
 
     plan = Plan("UR10", "eye-in-hand", (PlannedPose("p01", (0.0,) * 6),), criterion=criterion)
     link = Elsewhere(plan)

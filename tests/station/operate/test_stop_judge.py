@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from recordings.schema.messages import RobotState, Stamps
@@ -9,6 +10,7 @@ from station.cell.arm_acceptance import ArmSubject, Figure, StopTestMove, StopWa
 from station.operate.stop_judge import judge
 from station.simulation.controller.state import Journal, Settings
 from station.simulation.controller.uploads import Upload
+from tests.recordings.small_recording import PLAYING
 from tests.weak_controller import WEAKNESSES, WeakRobot, weak
 
 START = (0.3, -1.6, 1.9, -1.9, -1.57, 0.0)
@@ -40,19 +42,14 @@ class Stand:
 
     def _state(self) -> RobotState:
         out = self.robot.outputs
-        return RobotState(
+        same = ("robot_mode", "safety_mode", "safety_status_bits", "runtime_state")
+        return msgspec.structs.replace(
+            PLAYING,
             stamps=Stamps(self.now_ns + 400_000, 0, self.robot.time_s),
-            joints_rad=out.vector("actual_q"),  # type: ignore[arg-type]
-            joint_speeds_rad_s=out.vector("actual_qd"),  # type: ignore[arg-type]
-            target_joints_rad=out.vector("target_q"),  # type: ignore[arg-type]
-            tcp_pose=out.vector("actual_TCP_pose"),  # type: ignore[arg-type]
-            robot_mode=int(out.get("robot_mode")),
-            safety_mode=int(out.get("safety_mode")),
-            safety_status_bits=int(out.get("safety_status_bits")),
-            runtime_state=int(out.get("runtime_state")),
-            robot_status_bits=int(out.get("robot_status_bits")),
-            speed_scaling=out.get("speed_scaling"),
-            target_speed_fraction=out.get("target_speed_fraction"),
+            joints_rad=out.vector("actual_q"),
+            joint_speeds_rad_s=out.vector("actual_qd"),
+            target_joints_rad=out.vector("target_q"),
+            **{name: int(out.get(name)) for name in same},
         )
 
     def test(self, way: StopWay, speed_rad_s: float = FAST_RAD_S) -> tuple[Figure, ...]:

@@ -14,7 +14,7 @@ from station.cell.arm_acceptance import STOP_GIVEN, ArmSubject, Figure, StopResu
 from station.cell.status import Event, MotionPreview, StationState, StationStatus
 from station.operate import stop_test
 from station.operate.stop_test import TRIES, AcceptanceTest
-from station.protocol.verbs import Go, Prepare, StopTest, Verb
+from station.protocol.verbs import Go, StopTest, Verb
 
 SUBJECT = ArmSubject("real", "UR10e", "1", "5.11", (), "ur_rtde")
 
@@ -35,7 +35,6 @@ class Daemon:
         if isinstance(verb, Go):
             self.went += 1
             return None
-        assert isinstance(verb, Prepare) and verb.stop_test is not None
         test = verb.stop_test
         self.asked.append(test)
         move = StopTestMove(test.way, SUBJECT, 0, 0.1, 0.1)

@@ -37,7 +37,7 @@ class Daemon:
     root, camera = None, "main"
 
     def __init__(self, mount: str = "eye-in-hand", **changes: object) -> None:
-        self.truth = make_cell("paper", 1, "low", mount)  # type: ignore[arg-type]
+        self.truth = make_cell("paper", 1, "low", mount)
         self.calibration = calibration_of(self.truth, ROBOT, CAMERA)
         self.board = np.array(self.truth.board_place)
         flange = forward(MODELS["UR10"], self.truth.start_joints_rad)
@@ -66,7 +66,7 @@ class Daemon:
 
     async def seen(self, folder: Path) -> SeenBoard:
         write_calibration(self.calibration, folder / "c.yaml")
-        return await see_board(self, folder / "c.yaml")  # type: ignore[arg-type]
+        return await see_board(self, folder / "c.yaml")
 
     def touching(self, place_m: Array, tip_m: tuple[float, ...] = TIP) -> StationStatus:
         """The arm with the tip there in `board`, however the flange is turned."""

@@ -158,7 +158,7 @@ async def test_arguments_that_do_not_fit_are_refused_in_words(
 ) -> None:
     async with await served.client() as anna:
         with pytest.raises(RefusedError) as caught:
-            await anna.request(verb, **args)  # type: ignore[arg-type]
+            await anna.request(verb, **args)
         assert len(str(caught.value).split()) > 3
 
 

@@ -39,7 +39,6 @@ def offered(manager: ApprovalManager, client_id: int = 1) -> MotionApproval:
     preview = msgspec.structs.replace(preview, start_joints_rad=HERE)
     motion = Motion(Purpose.RUN, PoseQueue(Plan("UR10", "eye-in-hand", ())), (0, 1, 2, 3))
     manager.offer(MotionApproval(motion, preview, client_id))
-    assert manager.waiting is not None
     return manager.waiting
 
 
@@ -67,13 +66,13 @@ def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
     clock = Clock()
     manager = ApprovalManager(clock)
     token = offered(manager).preview.token
-    clock.now_s += float(change.get("later_s", 0))  # type: ignore[arg-type]
+    clock.now_s += float(change.get("later_s", 0))
     with raises(code):
         manager.redeem(
-            change.get("token", token),  # type: ignore[arg-type]
-            change.get("client_id", 1),  # type: ignore[arg-type]
-            change.get("plan", PLAN),  # type: ignore[arg-type]
-            change.get("joints", HERE),  # type: ignore[arg-type]
+            change.get("token", token),
+            change.get("client_id", 1),
+            change.get("plan", PLAN),
+            change.get("joints", HERE),
         )
     with pytest.raises(RefusedError):
         manager.redeem(token, 1, PLAN, HERE)

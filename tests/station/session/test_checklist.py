@@ -68,11 +68,9 @@ async def test_without_news_the_driver_says_what_is_missing(rig: Rig) -> None:
 async def test_clocks_are_ok_only_where_frames_have_a_time(
     rig: Rig, source: TimeSource, clock: bool, bound_s: float, impossible: int, state: str
 ) -> None:
-    cell = rig.session.context.cell
-    capture = msgspec.structs.replace(cell.config.capture, time_bound_s=0.02)
-    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
+    rig.configure(capture={"time_bound_s": 0.02})
     fit = ClockFit(0.0, 0.0, 0.0001)
-    rig.arm.clock = lambda: fit  # type: ignore[method-assign]
+    rig.arm.clock = lambda: fit
     rig.camera.timing = FrameTiming(source, bound_s, fit if clock else None, impossible)
     found = await check(rig, "clocks")
     assert found.state == state and bool(found.remedy) == (state != "ok")
@@ -98,9 +96,7 @@ PLUGGED = UsbCamera("M", "S", "1", "2-1", 5000.0, True)
 async def test_a_camera_that_is_there_is_listed_with_what_keeps_it_from_being_used(
     rig: Rig, monkeypatch: pytest.MonkeyPatch, camera: FoundCamera | UsbCamera | None, state: str
 ) -> None:
-    cell = rig.session.context.cell
-    wired = msgspec.structs.replace(cell.config.camera, driver="aravis", device="S")
-    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=wired))
+    rig.configure(camera={"driver": "aravis", "device": "S"})
     for name, kind in (("discover", FoundCamera), ("discover_usb", UsbCamera)):
         there = [camera] if isinstance(camera, kind) else []
         monkeypatch.setattr(f"station.session.checklist.{name}", lambda there=there: there)

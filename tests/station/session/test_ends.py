@@ -69,8 +69,7 @@ async def test_control_has_ended_before_the_recording_is_sealed(
         return await seal(self, queue)
 
     monkeypatch.setattr(SessionRecording, "seal", noted)
-    await rig.give_go()
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE)
     assert rig.arm.log.index("end control") < rig.arm.log.index("seal")
 
 
@@ -78,8 +77,7 @@ async def test_a_disk_that_fails_after_stop_is_told_and_stop_stays_latched(
     rig: Rig, held_disk: HeldDisk
 ) -> None:
     held_disk.fails = True
-    await rig.give_go()
-    await rig.until(S.WRITING)
+    await rig.go_until(S.WRITING)
     stopping = asyncio.ensure_future(rig.session.stop("bert"))
     await rig.until(S.STOPPED)
     held_disk.set()
@@ -92,10 +90,8 @@ async def test_a_disk_that_fails_after_stop_is_told_and_stop_stays_latched(
 
 
 async def test_a_picture_being_written_outlives_every_halt(rig: Rig, held_disk: HeldDisk) -> None:
-    await rig.give_go()
-    await rig.until(S.WRITING)
+    await rig.go_until(S.WRITING)
     run = rig.session._run
-    assert run is not None
     for _ in range(3):
         run.cancel()
         await asyncio.sleep(0.01)
@@ -106,8 +102,7 @@ async def test_a_picture_being_written_outlives_every_halt(rig: Rig, held_disk: 
 
 
 async def test_stop_is_answered_before_a_slow_disk_has_the_picture(rig: Rig, held_disk: HeldDisk) -> None:
-    await rig.give_go()
-    await rig.until(S.WRITING)
+    await rig.go_until(S.WRITING)
     await asyncio.wait_for(rig.session.stop("bert"), STOP_ANSWER_S)  # else `station capture` says: no answer
     assert "stop" in rig.arm.log
     held_disk.set()
@@ -170,8 +165,7 @@ async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
         await rig.pause_after_this_pose("anna")
         finishing = asyncio.ensure_future(rig.session.finish(1))
     else:
-        await rig.give_go()
-    await rig.until(S.SEALING)
+        await rig.go_until(S.SEALING)
     for _ in range(2):
         await rig.session.stop("bert")
         await rig.session.acknowledge("anna")
@@ -189,8 +183,7 @@ async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
 
 
 async def test_a_fault_between_moves_stops_the_arm_by_both_ways(rig: Rig, held_disk: HeldDisk) -> None:
-    await rig.give_go()
-    await rig.until(S.WRITING)
+    await rig.go_until(S.WRITING)
     rig.arm.trouble = RobotError()
     held_disk.set()
     await rig.until(S.FAULT)
@@ -208,8 +201,7 @@ async def test_a_defect_in_the_estimate_costs_one_estimate(rig: Rig, monkeypatch
         return await call(function, *args, timeout_s=timeout_s)
 
     monkeypatch.setattr(rig.worker, "call", broken)
-    await rig.give_go()
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE)
     await until(lambda: len(asked) > 1)
     assert rig.pose_states == ["done"] * POSES
 
@@ -219,7 +211,6 @@ async def test_a_call_that_hangs_costs_its_own_answer_only_and_nobody_waits_for_
 ) -> None:
     workers = Workers(start_worker, warm_up)
     await workers.start()
-    assert workers._pool is not None
     ended, waited = threading.Event(), list[bool]()
     for process in workers._pool._processes.values():  # ones that take their time to end
         monkeypatch.setattr(process, "join", lambda *_: waited.append(ended.wait(PATIENCE_S)))

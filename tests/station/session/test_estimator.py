@@ -63,11 +63,10 @@ async def half_way(new_rig: NewRig, plan: Plan, monkeypatch: pytest.MonkeyPatch)
     hurried = SimpleNamespace(**vars(time) | {"monotonic": lambda: 1000 * time.monotonic()})
     monkeypatch.setattr("station.session.recording.time", hurried)
     rig = await new_rig()
-    rig.session.context.workers = WorkerThatSees(rig)  # type: ignore[assignment]
+    rig.session.context.workers = WorkerThatSees(rig)
     rig.session.load_plan(1, plan)
     rig.session.store.watch(lambda: _pause_after(rig, BEFORE))
-    await rig.give_go()
-    await rig.until(S.PAUSED)
+    await rig.go_until(S.PAUSED)
     return rig
 
 
@@ -101,14 +100,13 @@ async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate(
     again = await new_rig(with_plan=False)
     elapsed_s = again.session.store.status.session.elapsed_s
     assert elapsed_s > 0.5 * known.session.elapsed_s > 0, "the time before the crash is part of the session's"
-    again.session.context.workers = WorkerThatLooksBack(half_way)  # type: ignore[assignment]
+    again.session.context.workers = WorkerThatLooksBack(half_way)
     again.session.take_lease(1, "anna")
     await again.session.acknowledge("anna")
     await again.session.prepare(1, Purpose.RESUME)
     await until(lambda: again.session.store.status.estimate.views == BEFORE)
     assert again.session.store.status.estimate.camera_pose == known.estimate.camera_pose
-    await again.give_go(Purpose.RESUME)
-    await again.until(S.IDLE)
+    await again.go_until(S.IDLE, purpose=Purpose.RESUME)
     assert again.session.store.status.session.elapsed_s > elapsed_s
     assert [view.index for view in sealed(again).views()] == list(range(POSES))
 

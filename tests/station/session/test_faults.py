@@ -22,12 +22,10 @@ from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
 async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: Rig) -> None:
     rig.camera.fail = ["frame lost", "frame lost"]
-    await rig.give_go()
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE)
     assert rig.pose_states == ["done"] * POSES
     rig.camera.fail = ["gone"] * 3
-    await rig.give_go()
-    await rig.until(S.PAUSED)
+    await rig.go_until(S.PAUSED)
     assert rig.pose_states == ["failed", "done", "done", "done"]
     assert rig.cause == "poses-failed"
     await rig.session.finish(1)
@@ -38,8 +36,7 @@ async def test_a_picture_without_the_board_does_not_count(rig: Rig) -> None:
     shown = rig.worker.sees
     hidden = msgspec.structs.replace(shown.status, found=False, corners=0, reason="board half hidden")
     rig.worker.sees = type(shown)(hidden, shown.indices[:0], shown.pixels[:0])
-    await rig.give_go()
-    await rig.until(S.PAUSED)
+    await rig.go_until(S.PAUSED)
     status = rig.session.store.status
     assert rig.pose_states == ["failed"] * 3 + ["planned"]
     assert status.session.poses[0].reason == "board half hidden"
@@ -49,8 +46,7 @@ async def test_a_picture_without_the_board_does_not_count(rig: Rig) -> None:
 
 async def test_an_arm_that_does_not_rest_fails_the_pose(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rig.session.context.stillness, "unrest", lambda found: "wrist 2 moves at 0.5°/s")
-    await rig.give_go()
-    await rig.until(S.PAUSED)
+    await rig.go_until(S.PAUSED)
     assert rig.session.store.status.session.poses[0].cause == "not-settled"
 
 
@@ -82,8 +78,7 @@ async def test_a_disk_that_fails_is_a_fault_and_never_a_pose_and_so_is_a_defect(
         raise error
 
     monkeypatch.setattr(SessionRecording, method, fails)
-    await rig.give_go()
-    await rig.until(S.FAULT)
+    await rig.go_until(S.FAULT)
     assert rig.cause == cause and str(error) in rig.session.store.status.reason
     await until(lambda: rig.arm.log[-1:] == ["end control"])
     assert "stop" in rig.arm.log and "done" not in rig.pose_states
@@ -91,9 +86,7 @@ async def test_a_disk_that_fails_is_a_fault_and_never_a_pose_and_so_is_a_defect(
 
 
 async def test_a_full_disk_is_told_before_anybody_is_asked(rig: Rig) -> None:
-    cell = rig.session.context.cell
-    capture = msgspec.structs.replace(cell.config.capture, free_space_bytes=10**18)
-    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
+    rig.configure(capture={"free_space_bytes": 10**18})
     with raises("disk-full"):
         await rig.session.prepare(1, Purpose.RUN)
 
@@ -127,8 +120,7 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
     second.session.take_lease(1, "anna")
     await second.session.acknowledge("anna")
     assert second.state is S.PAUSED
-    await second.give_go(Purpose.RESUME)
-    await second.until(S.IDLE)
+    await second.go_until(S.IDLE, purpose=Purpose.RESUME)
     recording = sealed(second)
     assert [view.index for view in recording.views()] == list(range(POSES))
     assert second.arm.log.count("move") == POSES - 1
@@ -148,14 +140,12 @@ async def test_a_lost_trigger_box_is_a_fault_of_the_session_until_the_next_go(ri
             raise gone.pop()
         return await capture(timeout_s)
 
-    rig.camera.capture = with_box  # type: ignore[method-assign]
-    await rig.give_go()
-    await rig.until(S.FAULT)
+    rig.camera.capture = with_box
+    await rig.go_until(S.FAULT)
     assert rig.session.store.status.cause == "trigger"
     assert "done" not in rig.pose_states
     await rig.session.acknowledge(1)
-    await rig.give_go()
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE)
     assert rig.pose_states == ["done"] * len(rig.pose_states)
 
 
@@ -185,17 +175,13 @@ async def test_17_a_camera_that_loses_the_first_frame_after_a_pause_is_woken(
 
     monkeypatch.setattr(rig.camera, "capture", dozing_capture)
     monkeypatch.setattr(rig.camera, "glimpse", dozing_glimpse)
-    await rig.give_go()
-    await rig.until(S.IDLE, S.PAUSED)
+    await rig.go_until(S.IDLE, S.PAUSED)
     assert rig.pose_states == ["done"] * len(rig.pose_states) and lost == 1
 
 
 async def test_25_a_pose_whose_time_is_too_uncertain_is_refused(rig: Rig) -> None:
-    cell = rig.session.context.cell
-    capture = msgspec.structs.replace(cell.config.capture, time_bound_s=0.001)  # no clock: ±25 ms
-    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
-    await rig.give_go()
-    await rig.until(S.PAUSED)
+    rig.configure(capture={"time_bound_s": 0.001})  # no clock: ±25 ms
+    await rig.go_until(S.PAUSED)
     values = rig.told("time-unsure")[0].values
     assert (values["bound_s"], values["limit_s"]) == (0.025, 0.001)
     assert "done" not in rig.pose_states
@@ -213,13 +199,11 @@ async def test_a_pose_that_does_not_come_to_rest_is_offered_to_a_person(
         return await glimpse()
 
     monkeypatch.setattr(rig.camera, "glimpse", ringing)
-    await rig.give_go()
-    await rig.until(S.PAUSED)
+    await rig.go_until(S.PAUSED)
     assert rig.pose_states == ["done", "failed", "done", "done"]
     assert rig.cause == "unsettled"
     moves = rig.arm.log.count("move")
     await rig.session.edit(1, Retake(1))
     assert rig.arm.log.count("move") == moves
-    await rig.give_go(Purpose.RESUME)
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE, purpose=Purpose.RESUME)
     assert rig.pose_states == ["done"] * POSES

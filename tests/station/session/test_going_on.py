@@ -32,9 +32,8 @@ async def end_of_any_run(rig: Rig, errors: list[RobotError]) -> Rig:
             raise left.pop(0)
         await move(*request)
 
-    rig.arm.move = fails_first  # type: ignore[method-assign]
-    await rig.give_go()
-    await rig.until(S.IDLE, S.PAUSED, S.FAULT, S.STOPPED)
+    rig.arm.move = fails_first
+    await rig.go_until(S.IDLE, S.PAUSED, S.FAULT, S.STOPPED)
     return rig
 
 
@@ -85,7 +84,7 @@ async def test_stop_and_a_lost_client_end_it_while_it_approves_again(
     async def ended_meanwhile(*_: Any) -> None:
         await (rig.session.stop("ben") if how == "stop" else rig.session.lease_lost(1))
 
-    summary = await rig.session.prepare(1, "run")  # type: ignore[arg-type]
+    summary = await rig.session.prepare(1, "run")
     monkeypatch.setattr("station.session.run.previewed", ended_meanwhile)
     monkeypatch.setattr(rig.arm, "move", _late)
     context = rig.session.context

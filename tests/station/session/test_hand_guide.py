@@ -24,7 +24,7 @@ from tests.station.session_rig import TRUTH, NewRig, Rig, crash, sealed
 @pytest.fixture
 async def guided(new_rig: NewRig) -> Rig:
     rig = await new_rig(with_plan=False, guides=True)
-    rig.session.context.workers = WorkerThatSees(rig)  # type: ignore[assignment]
+    rig.session.context.workers = WorkerThatSees(rig)
     await rig.until(S.IDLE)
     rig.session.take_lease(1, "anna")
     rig.arm.rest()
@@ -82,7 +82,7 @@ async def test_views_before_a_crash_count_in_the_guidance(guided: Rig, new_rig: 
     await until(lambda: captured(guided) == 1 and guided.state is S.FREE_DRIVE)
     crash(guided)
     again = await new_rig(with_plan=False, guides=True)
-    again.session.context.workers = WorkerThatLooksBack(guided)  # type: ignore[assignment]
+    again.session.context.workers = WorkerThatLooksBack(guided)
     again.session.take_lease(1, "anna")
     await again.session.acknowledge("anna")
     await again.session.switch_free_drive(1, True)

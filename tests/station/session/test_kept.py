@@ -48,8 +48,7 @@ async def test_a_change_that_the_disk_does_not_take_is_told_to_who_asked(
 async def test_a_drift_check_is_still_one_after_a_crash(new_rig: NewRig) -> None:
     first = await new_rig()
     first.arm.slow = True
-    await first.give_go(Purpose.DRIFT_CHECK)
-    await first.until(S.MOVING)
+    await first.go_until(S.MOVING, purpose=Purpose.DRIFT_CHECK)
     await first.pause_after_this_pose("anna")
     crash(first)
     second = await new_rig(with_plan=False)
@@ -61,21 +60,12 @@ async def test_a_drift_check_is_still_one_after_a_crash(new_rig: NewRig) -> None
     assert not second.session.store.status.session.check
 
 
-async def test_a_picture_counts_until_its_pose_was_taken_again(rig: Rig) -> None:
+async def test_a_picture_counts_until_its_pose_was_taken_again_by_an_arm_that_stands_there(rig: Rig) -> None:
     await rig.go_until_it_moves()
     await rig.pause_after_this_pose("anna")
     await rig.session.edit(1, Retake(0))
     assert rig.session.store.status.session.captured == 1
-    await rig.session.finish(1)
-    assert len(list(sealed(rig).views())) == rig.session.store.status.session.captured
-
-
-async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:
-    await rig.go_until_it_moves()
-    await rig.pause_after_this_pose("anna")
-    await rig.session.edit(1, Retake(0))
     rig.arm.slow = False
-    await rig.give_go(Purpose.RESUME)
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE, purpose=Purpose.RESUME)
     assert rig.arm.log.count("move") == POSES
     assert sealed(rig).views()[0].attempt == 2

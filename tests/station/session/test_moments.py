@@ -24,33 +24,28 @@ class HeldStart:
     def __init__(self, rig: Rig) -> None:
         self.go_on = asyncio.Event()
         self._start = rig.arm.start_control
-        rig.arm.start_control = self._held  # type: ignore[method-assign]
+        rig.arm.start_control = self._held
 
     async def _held(self) -> None:
         await self._start()
         await self.go_on.wait()
 
 
-async def test_a_pose_skipped_while_control_starts_is_not_driven(rig: Rig) -> None:
+@pytest.mark.parametrize("finishes", [False, True])
+async def test_a_pose_skipped_while_control_starts_is_not_driven_and_a_finish_seals_without_a_move(
+    rig: Rig, finishes: bool
+) -> None:
     held = HeldStart(rig)
     await rig.give_go()
     await until(lambda: rig.arm.control)
-    await rig.session.edit(1, Skip(1))
+    await (rig.session.finish(1) if finishes else rig.session.edit(1, Skip(1)))
     held.go_on.set()
     await rig.until(S.IDLE, S.FAULT)
     assert rig.state is S.IDLE, rig.session.store.status.reason
-    assert rig.pose_states == ["done", "skipped", *["done"] * (POSES - 2)]
-
-
-async def test_finish_while_control_starts_seals_without_a_move(rig: Rig) -> None:
-    held = HeldStart(rig)
-    await rig.give_go()
-    await until(lambda: rig.arm.control)
-    await rig.session.finish(1)
-    held.go_on.set()
-    await rig.until(S.IDLE, S.FAULT)
-    assert rig.state is S.IDLE, rig.session.store.status.reason
-    assert "move" not in rig.arm.log and rig.session.store.status.session.recording
+    if finishes:
+        assert "move" not in rig.arm.log and rig.session.store.status.session.recording
+    else:
+        assert rig.pose_states == ["done", "skipped", *["done"] * (POSES - 2)]
 
 
 async def test_a_lost_lease_before_anything_is_recorded_leaves_no_paused_session(
@@ -72,8 +67,7 @@ async def test_finish_before_a_way_that_is_not_free_seals(rig: Rig, monkeypatch:
         return limits._refused(name, [limits.Problem(name, "clearance", "forearm against table")])
 
     monkeypatch.setattr(run, "check_path", refused)
-    await rig.give_go()
-    await rig.until(S.IDLE, S.FAULT)
+    await rig.go_until(S.IDLE, S.FAULT)
     assert rig.state is S.IDLE, rig.session.store.status.reason
     assert "move" not in rig.arm.log
 
@@ -113,7 +107,7 @@ async def test_an_arm_that_moved_while_its_way_was_checked_is_not_driven(
     await rig.give_go()
     await until(slow.looks.is_set)
     first, *rest = rig.arm.joints
-    rig.arm.joints = (first + 0.02, *rest)  # type: ignore[assignment]
+    rig.arm.joints = (first + 0.02, *rest)
     logs: list[list[str]] = []
 
     def look() -> None:
@@ -147,8 +141,7 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
     rig: Rig, held_disk: HeldDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session, "END_RUN_S", 0.05)
-    await rig.give_go()
-    await rig.until(S.WRITING)
+    await rig.go_until(S.WRITING)
     await rig.session.stop("bert")
     await rig.session.acknowledge("anna")
     assert rig.state is S.PAUSED

@@ -35,7 +35,7 @@ async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_sess
     rig.arm.rest()
     told: list[int] = []
     at = rig.arm.at
-    rig.arm.at = lambda ns: told.append(ns) or at(ns)  # type: ignore[method-assign, func-returns-value]
+    rig.arm.at = lambda ns: told.append(ns) or at(ns)
     found = await rig.session.previews.observe(TAG)
     state = rig.arm.latest()
     assert found.corners == (0, 1, 2, 3)
@@ -49,7 +49,7 @@ async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_sess
 async def test_no_picture_of_an_arm_that_moves_or_of_a_session_is_told(rig: Rig) -> None:
     rig.arm.rest()
     at, state = rig.arm.at, rig.arm.latest()
-    rig.arm.at = lambda ns: msgspec.structs.replace(at(ns), joint_speeds_rad_s=(0.1,) * 6)  # type: ignore[method-assign]
+    rig.arm.at = lambda ns: msgspec.structs.replace(at(ns), joint_speeds_rad_s=(0.1,) * 6)
     with raises("moved-in-exposure"):
         await rig.session.previews.observe(TAG)
     taken, later_s = rig.camera.taken, state.stamps.controller_s + 0.008

@@ -27,8 +27,7 @@ async def test_a_tool_on_the_pendant_is_not_in_the_pose(rig: Rig, monkeypatch: p
 
     monkeypatch.setattr(rig.arm, "_state", with_tool)
     rig.arm.identity = RobotIdentity(model="UR10", serial="DOUBLE", tcp_offset=TOOL)
-    await rig.give_go()
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE)
     views = sealed(rig).views()
     assert len(views) == POSES
     for view in views:
@@ -55,8 +54,7 @@ async def test_it_is_the_pose_of_mid_exposure(rig: Rig, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(rig.camera, "capture", noted)
     monkeypatch.setattr(rig.arm, "at", at)
-    await rig.give_go()
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE)
     views = sealed(rig).views()
     assert len(views) == POSES
     for view, picture in zip(views, pictures, strict=True):
@@ -97,7 +95,6 @@ async def test_what_speaks_against_the_pose_during_the_picture_counts(
         return await capture(timeout_s)
 
     monkeypatch.setattr(rig.camera, "capture", meanwhile)
-    await rig.give_go()
-    await rig.until(S.FAULT)
+    await rig.go_until(S.FAULT)
     assert rig.session.store.status.cause == "tcp-changed"
     assert rig.pose_states == ["planned"] * POSES

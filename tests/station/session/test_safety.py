@@ -34,7 +34,7 @@ class Gate:
         self.open = asyncio.Event()
         self.entered = asyncio.Event()
         self._call = rig.worker.call
-        rig.worker.call = self._held  # type: ignore[method-assign]
+        rig.worker.call = self._held
 
     async def _held(self, function: Any, *args: Any, timeout_s: float = 60.0) -> Any:
         self.entered.set()
@@ -126,7 +126,7 @@ async def test_an_arm_moved_while_control_started_is_not_driven(
     async def jogged() -> None:
         await start()
         first, *rest = rig.arm.joints
-        rig.arm.joints = (first + 0.05, *rest)  # type: ignore[assignment]
+        rig.arm.joints = (first + 0.05, *rest)
 
     monkeypatch.setattr(rig.arm, "start_control", jogged)
     await rig.give_go()
@@ -142,7 +142,6 @@ async def test_stop_while_an_interrupted_session_is_closed_stays_latched(
     await rig.go_until_it_moves()
     await rig.session.stop("bert")
     recorder = rig.session.context.require_recording().recorder
-    assert recorder is not None
     recorder.close()
     rig.session.context.recording = None  # as after a crash
     other = await new_rig(with_plan=False)
@@ -159,8 +158,7 @@ async def test_stop_while_an_interrupted_session_is_closed_stays_latched(
 
 
 async def test_finish_waits_for_what_is_being_written(rig: Rig, held_disk: HeldDisk) -> None:
-    await rig.give_go()
-    await rig.until(S.WRITING)
+    await rig.go_until(S.WRITING)
     losing = asyncio.ensure_future(rig.session.lease_lost(1))
     await rig.until(S.PAUSED)
     rig.session.take_lease(2, "bert")
@@ -184,7 +182,7 @@ async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_p
         await stop(reason)
         await asyncio.sleep(0.05)
 
-    rig.arm.stop = slow_stop  # type: ignore[method-assign]
+    rig.arm.stop = slow_stop
     await rig.go_until_it_moves()
     with socket.socket(socket.AF_UNIX) as client:
         client.setblocking(False)
@@ -249,8 +247,7 @@ async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch
 
     monkeypatch.setattr(SessionRecording, "sync", no_sync)
     monkeypatch.setattr(Recorder, "close", slow_close)
-    await rig.give_go()
-    await rig.until(S.FAULT)
+    await rig.go_until(S.FAULT)
     await until(went_on.is_set)
 
 

@@ -33,8 +33,7 @@ WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
 
 
 async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> None:
-    await rig.give_go()
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE)
     assert rig.states == [S.IDLE, S.CHECKING, *WHOLE_POSE * POSES, S.SEALING, S.IDLE]
     assert rig.pose_states == ["done"] * POSES
     assert rig.arm.log[: POSES + 2] == ["start control", *["move"] * POSES, "end control"]
@@ -66,9 +65,7 @@ async def test_a_recording_tells_of_arm_clocks_and_camera(
     clock = ClockFit(0.0, 0.0, 0.004)
     rig.arm.kinematics = table
     monkeypatch.setattr(rig.arm, "clock", lambda: clock)
-    cell = rig.session.context.cell
-    camera = msgspec.structs.replace(cell.config.camera, name="overhead")
-    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=camera))
+    rig.configure(camera={"name": "overhead"})
     with disk_order(monkeypatch) as order:
         await rig.give_go()
         await until(lambda: rig.pose_states[0] == "done")
@@ -116,34 +113,12 @@ async def test_pause_is_after_this_pose_and_going_on_needs_a_new_go(rig: Rig) ->
     await asyncio.sleep(0.05)
     assert rig.arm.log.count("move") == 1
     rig.arm.slow = False
-    await rig.give_go(Purpose.RESUME)
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE, purpose=Purpose.RESUME)
     assert len(sealed(rig).views()) == POSES
 
 
-async def test_stop_is_latched_and_the_go_is_gone(rig: Rig) -> None:
-    await rig.go_until_it_moves()
-    await rig.session.stop("bert")
-    assert rig.state is S.STOPPED
-    assert "stop" in rig.arm.log
-    assert rig.pose_states == ["planned"] * POSES
-    resume, run = rig.give_go(Purpose.RESUME), rig.session.prepare(1, Purpose.RUN)
-    for forbidden in (resume, run, rig.session.finish(1)):
-        with raises("wrong-state"):
-            await forbidden
-    await rig.session.acknowledge("anna")
-    assert rig.state is S.PAUSED
-    moves = rig.arm.log.count("move")
-    await asyncio.sleep(0.05)
-    assert rig.arm.log.count("move") == moves
-    rig.arm.slow = False
-    await rig.give_go(Purpose.RESUME)
-    await rig.until(S.IDLE)
-    assert len(sealed(rig).views()) == POSES
-
-
-@pytest.mark.parametrize("phase", [S.SETTLING, S.CAPTURING, S.WRITING, S.SEALING])
-async def test_stop_in_every_phase_keeps_what_was_taken(rig: Rig, phase: S) -> None:
+@pytest.mark.parametrize("phase", [*WHOLE_POSE, S.SEALING])
+async def test_stop_in_every_phase_is_latched_and_keeps_what_was_taken(rig: Rig, phase: S) -> None:
     stopped = asyncio.Event()
 
     def press() -> None:
@@ -159,12 +134,18 @@ async def test_stop_in_every_phase_keeps_what_was_taken(rig: Rig, phase: S) -> N
     assert rig.state is S.STOPPED
     assert "stop" in rig.arm.log
     assert not {"moving", "settling", "capturing", "writing"} & set(rig.pose_states)
+    resume, run = rig.give_go(Purpose.RESUME), rig.session.prepare(1, Purpose.RUN)
+    for forbidden in (resume, run, rig.session.finish(1)):
+        with raises("wrong-state"):
+            await forbidden
+    moves = rig.arm.log.count("move")
     await rig.session.acknowledge("anna")
+    await asyncio.sleep(0.05)
+    assert rig.arm.log.count("move") == moves, "the go is gone"
     if phase is S.SEALING:
         assert rig.state is S.IDLE
     else:
-        await rig.give_go(Purpose.RESUME)
-        await rig.until(S.IDLE)
+        await rig.go_until(S.IDLE, purpose=Purpose.RESUME)
     assert len(sealed(rig).views()) == POSES
 
 
@@ -231,8 +212,7 @@ async def test_nobody_approves_what_the_arm_will_refuse(rig: Rig, monkeypatch: p
 
 async def test_a_refused_control_leaves_everything_as_it_was(rig: Rig, tmp_path: Path) -> None:
     rig.arm.refuse_control = RobotError("local-control")
-    await rig.give_go()
-    await rig.until(S.IDLE)
+    await rig.go_until(S.IDLE)
     assert rig.cause == "local-control"
     assert not list(tmp_path.rglob("*.part"))
     rig.arm.refuse_control = None

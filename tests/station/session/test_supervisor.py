@@ -21,8 +21,7 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
     rig.arm.arrive.set()
     await rig.until(S.PAUSED)
     await until(lambda: rig.session.store.status.pending == "")
-    await rig.give_go(Purpose.RESUME)
-    await rig.until(S.MOVING)
+    await rig.go_until(S.MOVING, purpose=Purpose.RESUME)
     await rig.session.finish(1)
     await until(lambda: rig.session.store.status.pending == supervisor.FINISHES)
 

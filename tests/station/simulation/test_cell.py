@@ -16,7 +16,7 @@ from station.simulation.truth import CellTruth, read_truth, write_truth
 
 
 def camera_from_board(cell: CellTruth, joints_rad: object) -> np.ndarray:
-    flange = forward(MODELS[cell.robot_model], joints_rad)  # type: ignore[arg-type]
+    flange = forward(MODELS[cell.robot_model], joints_rad)
     X, Y = np.array(cell.camera_mount), np.array(cell.board_place)
     return inverse(flange @ X) @ Y if cell.mount == "eye-in-hand" else inverse(X) @ flange @ Y
 
@@ -37,7 +37,6 @@ def test_the_papers_scene_is_the_default() -> None:
 def test_the_blogs_scene_has_its_lens_board_and_answer() -> None:
     cell = make_cell("blog")
     assert cell.board == BLOG_BOARD and (cell.camera.width, cell.camera.height) == (960, 720)
-    assert cell.camera.matrix is not None
     assert 2 * np.degrees(np.arctan(360 / cell.camera.matrix[1][1])) == pytest.approx(31.0482)
     printed = np.array([[0.965926, 0, -0.258819, 0.1], [0, 1, 0, 0], [0.258819, 0, 0.965926, 0]])
     assert np.abs(np.array(cell.camera_mount)[:3] - printed).max() < 1e-6
@@ -46,7 +45,7 @@ def test_the_blogs_scene_has_its_lens_board_and_answer() -> None:
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None:
-    cell = make_cell(seed=seed, mount=mount)  # type: ignore[arg-type]
+    cell = make_cell(seed=seed, mount=mount)
     view = camera_from_board(cell, cell.start_joints_rad)
     centre = transform_points(view, board_centre(cell.board))
     assert 0.4 < centre[2] < 0.65 and np.hypot(*centre[:2]) < 0.05
@@ -69,7 +68,6 @@ def test_the_guess_is_off_but_within_its_own_sigmas() -> None:
     for seed in range(1, 6):
         cell = make_cell(seed=seed)
         guess = cell_config(cell).camera_guess
-        assert guess is not None
         t = np.array(guess.translation_m)
         off = np.linalg.norm(t - np.array(cell.camera_mount)[:3, 3])
         assert 0 < off < 2 * np.sqrt(3) * guess.sigma_m

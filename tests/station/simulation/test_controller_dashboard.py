@@ -42,14 +42,15 @@ def test_e_series_in_local_control_refuses_stop_and_answers_questions(controller
     assert replies[1] == "false" and "5.11.1.108318" in replies[2] and replies[3] == LOCAL_REFUSAL
 
 
-def test_remote_control_frees_the_next_connection_only(controller, admin) -> None:
+def test_remote_control_frees_the_next_connection_only(controller) -> None:
     running = controller("UR10e", options=("--local",))
     with (
         socket.create_connection((running.host, 29999), 3) as link,
         link.makefile("rw", newline="\n") as lines,
+        running.admin() as admin,
     ):
         lines.readline()
-        admin(running).ask("remote", on=True)
+        admin.ask("remote", on=True)
         lines.write("stop\n")
         lines.flush()
         assert lines.readline().strip() == LOCAL_REFUSAL

@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 
 from calibrate.boards.detect import detect
-from station.cell.config import CameraConfig
-from station.devices.aravis import AravisCamera
 from station.simulation.cells import make_cell
 from station.simulation.launch import SimulatedController, start_gige
 from station.simulation.netns import is_isolated, isolated_command
 from station.simulation.truth import write_truth
 from tests.codes import raises
+from tests.gige_vision.opened import opened
 
 
 def test_it_does_not_run_beside_other_networks() -> None:
@@ -35,13 +34,9 @@ async def test_its_pictures_show_the_board_from_where_the_arm_stands(
     write_truth(cell, tmp_path / "truth.json")
     arm = controller(truth=tmp_path / "truth.json")
     with start_gige(arm.host, truth=tmp_path / "truth.json", serial="SIM00002"):
-        camera = AravisCamera(CameraConfig(device="127.0.0.1", packet_size=8996))
-        await camera.open()
-        try:
+        async with opened(packet_size=8996, exposure_us=10_000.0) as camera:
             picture = await camera.capture()
             assert detect(picture.pixels, cell.board).found
-        finally:
-            await camera.close()
 
 
 def test_a_command_can_be_run_with_nothing_but_lo() -> None:

@@ -48,7 +48,6 @@ def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe(number: signal.
         "time.sleep(30)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    assert parent.stdout is not None
     child, sibling = map(int, parent.stdout.readline().split())
     try:
         parent.send_signal(number)

@@ -58,23 +58,6 @@ def test_a_value(expression: str, value: Any) -> None:
     assert found == value and type(found) is type(value)
 
 
-BLOCKS = """
-def counted():
-  n = 0
-  while True:
-    n = n + 1
-    if n == 2:
-      continue
-    elif n > 5:
-      break
-    else:
-      say(n)
-    end
-  end
-  return
-  say("never")
-end
-"""
 SCOPE = """
 def prog():
   global shared = 1
@@ -96,38 +79,10 @@ def prog():
   say(around)
 end
 """
-THREADS = """
-def prog():
-  global n = 0
-  thread count(step):
-    while True:
-      n = n + step
-      sync()
-    end
-  end
-  hand = run count(10)
-  sync()
-  say(n)
-  sync()
-  say(n)
-  kill hand
-  sync()
-  say(n)
-end
-"""
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        (BLOCKS, [1, 3, 4, 5]),
-        (SCOPE, [11, 20, 100, 3, 15]),
-        (THREADS, [10, 20, 20]),
-    ],
-    ids=["blocks", "scope", "threads"],
-)
-def test_a_program_says(text: str, expected: list[Any]) -> None:
-    assert said(text) == expected
+def test_names_of_a_function_are_its_own_unless_they_were_there_before() -> None:
+    assert said(SCOPE) == [11, 20, 100, 3, 15]
 
 
 def test_kill_ends_what_the_thread_waits_for() -> None:

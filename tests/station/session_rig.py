@@ -191,7 +191,7 @@ class CameraInMemory:
     def __init__(self) -> None:
         self.identity = CameraIdentity(model="double", serial="1", driver="rendered")
         self.timing = FrameTiming("arrival", BOUND_S)
-        self.fail: list[str] = []
+        self.fail: list[str | Exception] = []
         self.taken = 0
         self.jumps = 0
         self.glimpses = 0
@@ -205,7 +205,7 @@ class CameraInMemory:
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
         if self.fail:
-            raise CameraError(reason=self.fail.pop(0))
+            raise why if isinstance((why := self.fail.pop(0)), Exception) else CameraError(reason=why)
         self.taken += 1
         shape, now_ns = (TRUTH.camera.height, TRUTH.camera.width), time.monotonic_ns()
         return Image(

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from calibrate.files.install import install, set_validity
+from calibrate.files.install import install, rollback, set_validity
 from calibrate.files.validity import ValidityReason, ValidityState
 from tests.patience import PATIENCE_S
 
@@ -50,17 +50,29 @@ def follow(ended: list[subprocess.Popen[str]], root: Path) -> subprocess.Popen[s
     return started(ended, *command)
 
 
-def test_every_change_is_one_line(ended: list[subprocess.Popen[str]], root: Path) -> None:
+def test_every_change_is_one_line(
+    ended: list[subprocess.Popen[str]], root: Path, make_file: MakeFile
+) -> None:
     told = lines(follow(ended, root))
     first = next(told)
     assert (first["event"], first["version"], first["validity"]["state"]) == ("installed", 1, "valid")
     assert first["result"]["child_frame"] == "camera" and first["intrinsics"]["width"] > 0
-    set_validity(root, ValidityState.IN_DOUBT, ValidityReason("drift-check", "moved"))
-    doubted = next(told)
-    assert (doubted["event"], doubted["validity"]["reason"]["code"]) == ("in-doubt", "drift-check")
-    (root / "calibrations/current").unlink()
-    gone = next(told)
-    assert (gone["event"], gone["version"], gone["result"]) == ("unreadable", None, None)
+    moved = ValidityReason("drift-check", "moved")
+    steps: dict[str, Callable[[], object]] = {
+        "in-doubt": lambda: set_validity(root, ValidityState.IN_DOUBT, moved),
+        "valid": lambda: set_validity(root, ValidityState.VALID, moved),
+        "installed": lambda: install(make_file(0.001), root),
+        "rolled-back": lambda: rollback(root),
+        "unreadable": (root / "calibrations/current").unlink,
+    }
+    change = {}
+    for event, step in steps.items():
+        step()
+        change[event] = next(told)
+        assert change[event]["event"] == event
+    assert change["in-doubt"]["validity"]["reason"]["code"] == "drift-check"
+    assert change["rolled-back"]["validity"]["state"] == "unverified"
+    assert (change["unreadable"]["version"], change["unreadable"]["result"]) == (None, None)
 
 
 def test_it_ends_when_nobody_reads(ended: list[subprocess.Popen[str]], root: Path) -> None:

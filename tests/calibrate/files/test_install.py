@@ -47,22 +47,6 @@ def test_the_next_step_of_a_solve_is_one_that_works() -> None:
     )
 
 
-def test_install_list_rollback(make_file, tmp_path: Path) -> None:
-    root = tmp_path / "state"
-    first, second = make_file(), make_file(0.001)
-    install(first, root)
-    install(second, root)
-    assert installed_calibration(root).result == read_calibration(second).result
-    assert [(g.number, g.current) for g in installed_versions(root)] == [(1, False), (2, True)]
-    rollback(root)
-    assert installed_calibration(root).result == read_calibration(first).result
-    rollback(root, to=2)
-    assert installed_calibration(root).result == read_calibration(second).result
-    assert [entry.action for entry in read_log(root)] == ["install", "install", "rollback", "rollback"]
-    assert read_log(root)[1].change.startswith("1.000 mm, 0.0000°")
-    assert (root / "calibrations/current").is_symlink()
-
-
 def test_what_undoes_an_install_is_named_and_works(make_file, tmp_path: Path) -> None:
     """The first has none before it: it is withdrawn. Every later one is rolled back."""
     root = tmp_path / "a state"

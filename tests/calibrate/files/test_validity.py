@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibrate import load_installed, watch
+from calibrate import load_installed
 from calibrate.errors import CalibrationFileError, InstallError, UsageError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.folders import cameras
@@ -189,13 +188,6 @@ def test_the_cells_own_rule_puts_an_old_proof_in_doubt(make_file: MakeFile, tmp_
     assert load_installed(root).validity.max_age_days is None
 
 
-def test_a_check_judges_the_version_that_it_was_made_on(root: Path, make_file: MakeFile) -> None:
-    install(make_file(0.001), root)
-    with raises("other-version", InstallError, version=2, judged=1):
-        set_validity(root, D, MOVED, version=1)
-    assert load_installed(root).validity.state is V
-
-
 def test_a_state_may_be_given_by_its_name_and_no_other_one(root: Path) -> None:
     proven = load_installed(root).validity.verified
     assert set_validity(root, D, MOVED).verified == proven, "a doubt proves nothing"
@@ -277,29 +269,3 @@ def test_a_damaged_file_is_never_loaded(root: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"translation_m: [", b"translation_m: [1", 1))
     with raises("damaged-calibration", CalibrationFileError):
         load_installed(root)
-
-
-def test_whoever_watches_hears_of_install_doubt_and_rollback(root: Path, make_file: MakeFile) -> None:
-    changes = watch(root, poll_s=0.01, stop_s=20)
-    heard = []
-    steps: list[Callable[[], object]] = [
-        lambda: install(make_file(0.001), root),
-        lambda: check(root, passed=False),
-        lambda: check(root, passed=True),
-        lambda: rollback(root),
-        lambda: (root / "calibrations/current").unlink(),
-    ]
-    for step in steps:
-        timer = threading.Timer(0.1, step)
-        timer.start()
-        heard.append(next(changes))
-        timer.join()
-    assert [change.event for change in heard] == [
-        "installed",
-        "in-doubt",
-        "valid",
-        "rolled-back",
-        "unreadable",
-    ]
-    assert heard[3].installed is not None and heard[3].installed.validity.state is U
-    assert heard[4].problem is not None and heard[4].problem.code == "nothing-installed"

@@ -9,7 +9,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from calibrate.errors import CalibrationError
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import MotionPreview, PoseStatus, SessionStatus, StationState, StationStatus
@@ -86,17 +85,6 @@ async def test_it_is_loaded_again_where_nothing_was_started(refused: type[verbs.
         with pytest.raises(RefusedError):
             await start_drift_check(link, loaded(0), person.approves)
     assert link.asked[-1] == verbs.LoadPlan(LOADED)
-
-
-async def test_nothing_is_planned_where_nothing_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def nothing(root: Path, camera: str) -> None:
-        raise CalibrationError("nothing is installed")
-
-    monkeypatch.setattr(drift_check, "installed_calibration", nothing)
-    link = FakeLink()
-    with pytest.raises(CalibrationError):
-        await start_drift_check(link, loaded(), Person().approves)
-    assert link.asked == []
 
 
 def during(name: str, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:

@@ -97,19 +97,6 @@ async def test_the_socket_is_the_groups_and_knows_its_peer(server: Served, handl
     await until(lambda: handler.lost)
 
 
-async def test_stop_passes_everything_that_is_queued(server: Served, handler: RecordingHandler) -> None:
-    _, path = server
-    async with Client(path) as busy, Client(path) as other:
-        planning = asyncio.create_task(busy.request("make_plan", poses=25))
-        await asyncio.sleep(0)
-        await busy.request("stop")
-        await other.request("stop")
-        assert handler.order.count("stop") == 2
-        assert "make_plan" not in handler.order
-        handler.release.set()
-        await planning
-
-
 async def test_watchers_get_everything_once_then_only_changes(server: Served) -> None:
     control, path = server
     async with Client(path) as client:

@@ -42,14 +42,6 @@ def offered(manager: ApprovalManager, client_id: int = 1) -> MotionApproval:
     return manager.waiting
 
 
-def test_a_go_is_for_one_use() -> None:
-    manager = ApprovalManager(Clock())
-    go = offered(manager)
-    assert manager.redeem(go.preview.token, 1, PLAN, HERE) == go
-    with raises("approval-used"):
-        manager.redeem(go.preview.token, 1, PLAN, HERE)
-
-
 @pytest.mark.parametrize(
     ("change", "code"),
     [
@@ -76,14 +68,3 @@ def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
         )
     with pytest.raises(RefusedError):
         manager.redeem(token, 1, PLAN, HERE)
-
-
-def test_a_newer_go_replaces_the_older_and_void_ends_both() -> None:
-    manager = ApprovalManager(Clock())
-    old, new = offered(manager), offered(manager)
-    assert old.preview.token != new.preview.token
-    manager.void()
-    assert manager.waiting is None
-    for go in (old, new):
-        with pytest.raises(RefusedError):
-            manager.redeem(go.preview.token, 1, PLAN, HERE)

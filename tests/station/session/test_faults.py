@@ -132,15 +132,7 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
 
 async def test_a_lost_trigger_box_is_a_fault_of_the_session_until_the_next_go(rig: Rig) -> None:
     """The session's own devices in memory; the camera's box is gone at the first picture."""
-    capture = rig.camera.capture
-    gone = [TriggerError()]
-
-    async def with_box(timeout_s: float = 5.0) -> Image:
-        if gone:
-            raise gone.pop()
-        return await capture(timeout_s)
-
-    rig.camera.capture = with_box
+    rig.camera.fail = [TriggerError()]
     await rig.go_until(S.FAULT)
     assert rig.session.store.status.cause == "trigger"
     assert "done" not in rig.pose_states

@@ -19,16 +19,10 @@ from tests.station.session_rig import Rig
 
 
 @pytest.mark.parametrize("broken", [TriggerError(), ZeroDivisionError("a defect")])
-async def test_a_picture_that_ends_oddly_leaves_no_state_of_work(
-    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch, broken: Exception
-) -> None:
+async def test_a_picture_that_ends_oddly_leaves_no_state_of_work(bare_rig: Rig, broken: Exception) -> None:
     bare_rig.arm.rest()
     await bare_rig.session.switch_free_drive(1, True)
-
-    async def capture(timeout_s: float = 5.0) -> None:
-        raise broken
-
-    monkeypatch.setattr(bare_rig.camera, "capture", capture)
+    bare_rig.camera.fail = [broken]
     with contextlib.suppress(type(broken)):
         await bare_rig.session.record(1)
     assert bare_rig.state is S.FAULT

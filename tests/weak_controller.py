@@ -6,7 +6,6 @@ Each weakness is what an acceptance test of the arm must find.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from typing import Any
 
 from station.devices.rtde import SafetyMode
@@ -39,9 +38,6 @@ class WeakArm(SimulatedArm):
         return super().start(goal, speed * (FASTER if self.weakness == "too-fast" else 1), acceleration)
 
     def brake(self, deceleration_rad_s2: float) -> None:
-        self._weakly(lambda: super(WeakArm, self).brake(deceleration_rad_s2))
-
-    def _weakly(self, brake: Callable[[], None]) -> None:
         if not self.moving:
             return
         self.braked = True
@@ -49,10 +45,8 @@ class WeakArm(SimulatedArm):
             self.ignored = True
         elif self.weakness == "abrupt-braking":
             self.freeze()
-        elif self.weakness == "slow-braking":
-            super().brake(SLOW_RAD_S2)
         else:
-            brake()
+            super().brake(SLOW_RAD_S2 if self.weakness == "slow-braking" else deceleration_rad_s2)
 
 
 class WeakRobot(SimulatedRobot):

@@ -9,6 +9,7 @@ import asyncio
 import inspect
 import json
 import os
+import signal
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
@@ -193,3 +194,7 @@ async def cell(
     yield make
     for made in cells:
         await made.end()
+
+
+def child_gets(number: signal.Signals) -> Callable[[Cell], None]:
+    return lambda c: os.kill(c.control_pid, number)

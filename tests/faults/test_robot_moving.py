@@ -15,7 +15,7 @@ from station.devices.base import ready
 from station.devices.news import Delay
 from station.devices.ur_child import ControlChild
 from tests.codes import raises
-from tests.faults.conftest import Cell, MakeCell
+from tests.faults.conftest import Cell, MakeCell, child_gets
 from tests.patience import until
 
 pytestmark = pytest.mark.process
@@ -42,10 +42,6 @@ async def test_safety_stop(cell: MakeCell, model: str, fault: str, code: str) ->
 
 def heart_stands_still(c: Cell) -> None:
     c.beating = False
-
-
-def child_gets(number: signal.Signals) -> Any:
-    return lambda c: os.kill(c.control_pid, number)
 
 
 def cut(how: str, ports: list[str] | None) -> dict[str, Any]:

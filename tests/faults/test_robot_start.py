@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 from contextlib import suppress
 from typing import Any
@@ -14,7 +13,7 @@ from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
 from station.devices.ur_state import StateReader
 from tests.codes import raises
-from tests.faults.conftest import Cell, MakeCell
+from tests.faults.conftest import Cell, MakeCell, child_gets
 from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.process
@@ -100,10 +99,6 @@ async def test_a_heart_that_beats_late_is_in_time(cell: MakeCell) -> None:
     c.beating = True
     await starting
     assert c.robot.control
-
-
-def child_gets(number: signal.Signals) -> Any:
-    return lambda c: os.kill(c.control_pid, number)
 
 
 BEFORE_THE_FIRST: dict[str, tuple[Any, bool, str]] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import shutil
 import signal
@@ -13,10 +14,15 @@ import sys
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
+from calibrate.cli import main as calibrate
+from calibrate.files.versions import installed_versions
+from calibrate.geometry import Array, difference
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState, StationStatus
@@ -24,7 +30,8 @@ from station.devices.news import Delay
 from station.protocol.client import Client
 from station.simulation.cells import cell_config, make_cell
 from station.simulation.launch import AdminClient, SimulatedController
-from station.simulation.truth import write_truth
+from station.simulation.truth import read_truth, write_truth
+from tests.command_line import call
 from tests.conftest import AT_REST_RAD_S, CONTROL_PATHS, rests_short_of_its_goal
 from tests.patience import PATIENCE_S, until
 from tests.station.quick_plan import quick_plan
@@ -178,6 +185,21 @@ async def go(client: Client, plan: Plan | None, purpose: str = "run") -> None:
             except RefusedError as refused:
                 if refused.code not in set(Delay):
                     raise
+
+
+def solved(recording: Path | str, result: Path, truth: Path, *options: object) -> tuple[Any, Array]:
+    """The answer of `calibrate solve` with its error (6,), which is within what it claims."""
+    answer = json.loads(call(calibrate, "solve", recording, "-o", result, *options, "--json").stdout)
+    off = difference(np.array(answer["result"]["matrix"]), np.array(read_truth(truth).camera_mount))
+    # 22.5: the 99.9 % quantile of chi-square with 6 degrees of freedom.
+    assert off @ np.linalg.solve(np.array(answer["covariance"]), off) < 22.5
+    return answer, off
+
+
+def installs_where_it_is_from(result: Path, root: Path, real: Path) -> None:
+    """In the simulated cell's folder, and not in the real one's."""
+    assert call(calibrate, "install", result, "--root", real).returncode == 1 and not installed_versions(real)
+    assert call(calibrate, "install", result, "--cell", "simulated", "--root", root).returncode == 0
 
 
 @pytest.fixture

@@ -16,9 +16,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.cli import main as calibrate
 from calibrate.files.install import installed_calibration
-from calibrate.geometry import difference, interpolate, quaternion_from_matrix
+from calibrate.geometry import interpolate, quaternion_from_matrix
 from station.cell.config import CameraConfig, CaptureConfig, RobotConfig
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import PlannedPose
@@ -27,10 +26,8 @@ from station.cli.daemon import own_daemon
 from station.protocol.client import Client
 from station.protocol.verbs import Finish, Freedrive, Record
 from station.simulation.cells import cell_config, make_cell
-from station.simulation.truth import read_truth
-from tests.command_line import call
 from tests.station.quick_plan import quick_plan
-from tests.system.conftest import status_when
+from tests.system.conftest import installs_where_it_is_from, solved, status_when
 
 pytestmark = pytest.mark.process
 TRUTH = make_cell("paper-binned", seed=3)
@@ -120,14 +117,9 @@ async def test_views_by_hand_become_an_installed_calibration_that_knows_the_arm(
             await client.call(Finish(), timeout_s=60.0)
             status = await status_when(client, lambda s: bool(s.session.recording))
     assert status.session.captured >= POSES
-    solved = call(calibrate, "solve", status.session.recording, "-o", result, "--json")
-    answer = json.loads(solved.stdout)
     root = tmp_path / "rehearsal"
-    true = np.array(read_truth(root / "simulation" / "truth.json").camera_mount)
-    off = difference(np.array(answer["result"]["matrix"]), true)
-    # 22.5: the 99.9 % quantile of chi-square with 6 degrees of freedom.
-    assert answer["verdict"] == "pass" and off @ np.linalg.solve(np.array(answer["covariance"]), off) < 22.5
+    answer, _ = solved(status.session.recording, result, root / "simulation" / "truth.json")
+    assert answer["verdict"] == "pass"
     assert len(answer["arm"]["table"]) > 30  # its links and flexing were learned from the joints
-    assert call(calibrate, "install", result, "--root", tmp_path / "real").returncode == 1
-    assert call(calibrate, "install", result, "--cell", "simulated", "--root", root).returncode == 0
+    installs_where_it_is_from(result, root, tmp_path / "real")
     assert installed_calibration(root).robot.model == "arm of a friend"

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import socket
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 
 import station
-from calibrate.cli import main as calibrate
 from calibrate.files.calibration import read_calibration
 from calibrate.files.formatting import predicted_error
 from calibrate.files.install import installed_calibration
-from calibrate.files.versions import installed_versions
-from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.cell.status import StationState
 from station.cli.daemon import own_daemon
@@ -28,9 +23,8 @@ from station.operate.new_cell import write_config
 from station.protocol.client import Client
 from station.protocol.verbs import GetPlan, MakePlan, Purpose
 from station.simulation.cells import make_cell
-from station.simulation.truth import read_truth
-from tests.command_line import call
 from tests.station.operate.guided_views import draft_of
+from tests.system.conftest import installs_where_it_is_from, solved
 
 pytestmark = pytest.mark.process
 ROBOT, CAMERA = "127.66.6.6", "127.66.6.7"
@@ -108,16 +102,10 @@ async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path
             await shell.client.call(MakePlan(POSES, 0), timeout_s=120.0)
             outcome = await shell.carry_out(Purpose.RUN)
             assert outcome.session.captured >= POSES - 2
-    solved = call(calibrate, "solve", outcome.session.recording, "-o", result, "--report", report, "--json")
-    answer = json.loads(solved.stdout)
-    simulated = np.array(read_truth(root / "simulation" / "truth.json").camera_mount)
-    off = difference(np.array(answer["result"]["matrix"]), simulated)
-    # 22.5: the 99.9 % quantile of chi-square with 6 degrees of freedom.
-    assert answer["verdict"] == "pass" and off @ np.linalg.solve(np.array(answer["covariance"]), off) < 22.5
+    truth_file = root / "simulation" / "truth.json"
+    answer, _ = solved(outcome.session.recording, result, truth_file, "--report", report)
+    assert answer["verdict"] == "pass"
     reached = predicted_error(read_calibration(result).quality.predicted_error_mm, None).value
     assert f"The real run should reach {reached}" in report.read_text()
-    assert call(calibrate, "install", result, "--cell", "simulated", "--root", root).returncode == 0
+    installs_where_it_is_from(result, root, tmp_path / "real")
     assert installed_calibration(root).created == read_calibration(result).created
-    real = tmp_path / "real"
-    assert call(calibrate, "install", result, "--root", real).returncode == 1
-    assert not installed_versions(real)

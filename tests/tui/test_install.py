@@ -12,7 +12,7 @@ from textual.pilot import Pilot
 from textual.widgets import Input, Static
 from textual.widgets._footer import FooterKey
 
-from calibrate.files.calibration import Calibration, Override, read_calibration, write_calibration
+from calibrate.files.calibration import Calibration, read_calibration, write_calibration
 from calibrate.files.folders import calibrations_folder, current_validity
 from calibrate.files.formatting import figures, summary
 from calibrate.files.install import install, installed_calibration
@@ -152,14 +152,6 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
         await pilot.press("b")
         await until(pilot, lambda: "out of use" in said(pilot))
         assert not isinstance(pilot.app.screen, Reason)
-
-
-def test_a_calibration_that_was_installed_all_the_same_says_by_whom_and_why() -> None:
-    taken = Override("measured with the tape", "anna", ["corner 0 is off"])
-    now = Installed(msgspec.structs.replace(DOUBTED, override=taken))
-    told = verdict_lines(Result("", DOUBTED, now)).plain
-    assert "Override by anna: “measured with the tape”" in told
-    assert "Override" not in verdict_lines(Result("", DOUBTED, Installed(DOUBTED))).plain
 
 
 async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready(

@@ -23,6 +23,14 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "some_job.py"
 
 
+@pytest.fixture
+def pid_file(job: Path) -> Path:
+    """Where a long job writes its own."""
+    path = job.with_name("pid")
+    job.write_text(f"import os, time; open({str(path)!r}, 'w').write(str(os.getpid())); time.sleep(600)")
+    return path
+
+
 @asynccontextmanager
 async def running(
     link: FakeLink, *args: str, size: tuple[int, int] = (80, 24)
@@ -62,9 +70,7 @@ async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, jo
         assert codes == [1]
 
 
-async def test_cancelling_ends_the_process(link: FakeLink, job: Path, tmp_path: Path) -> None:
-    pid_file = tmp_path / "pid"
-    job.write_text(f"import os, time; open({str(pid_file)!r}, 'w').write(str(os.getpid())); time.sleep(600)")
+async def test_cancelling_ends_the_process(link: FakeLink, pid_file: Path) -> None:
     async with running(link) as (pilot, screen, codes):
         await until(pilot, lambda: pid_file.exists() and pid_file.read_text())
         screen._begun_s = time.monotonic() - 65.0
@@ -80,9 +86,7 @@ async def test_cancelling_ends_the_process(link: FakeLink, job: Path, tmp_path: 
             os.kill(int(pid_file.read_text()), 0)
 
 
-async def test_leaving_the_program_ends_the_process(link: FakeLink, job: Path, tmp_path: Path) -> None:
-    pid_file = tmp_path / "pid"
-    job.write_text(f"import os, time; open({str(pid_file)!r}, 'w').write(str(os.getpid())); time.sleep(600)")
+async def test_leaving_the_program_ends_the_process(link: FakeLink, pid_file: Path) -> None:
     async with running(link) as (pilot, _screen, _codes):
         await until(pilot, lambda: pid_file.exists() and pid_file.read_text())
     with pytest.raises(ProcessLookupError):

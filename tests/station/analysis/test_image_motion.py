@@ -82,17 +82,15 @@ async def recorded(rig: Rig) -> list[float | None]:
     return [view.stillness.image_motion_px for view in views if view.stillness is not None]
 
 
-async def test_every_pose_is_recorded_with_its_pictures_motion(rig: Rig) -> None:
-    assert await recorded(rig) == [0.0] * POSES
-    assert rig.camera.glimpses == 3 * POSES
-
-
-async def test_a_moving_picture_is_not_captured_although_the_joints_rest(rig: Rig) -> None:
-    rig.camera.jumps = 3
-    await rig.go_until(S.PAUSED)
-    assert rig.camera.taken == 0 and "done" not in rig.pose_states
-    reason = rig.session.store.status.session.poses[0].reason
-    assert "the image moves by 23.48 px (limit 0.30)" in reason
+@pytest.mark.parametrize(
+    ("fails", "motion_px"), [([], 0.0), (["incomplete"], 0.0), (["no frame"] * 2 * POSES, None)]
+)
+async def test_every_pose_is_recorded_with_its_pictures_motion_where_it_was_measured(
+    rig: Rig, fails: list[str], motion_px: float | None
+) -> None:
+    rig.camera.glimpse_fails = list(fails)
+    assert await recorded(rig) == [motion_px] * POSES
+    assert len(rig.told("camera")) == (POSES if motion_px is None else 0)
 
 
 async def test_it_is_captured_as_soon_as_the_picture_rests(rig: Rig) -> None:
@@ -103,17 +101,6 @@ async def test_it_is_captured_as_soon_as_the_picture_rests(rig: Rig) -> None:
     rig.camera.jumps = 0
     await rig.until(S.IDLE)
     assert rig.pose_states == ["done"] * POSES
-
-
-async def test_what_cannot_be_looked_at_is_recorded_as_not_measured(rig: Rig) -> None:
-    rig.camera.glimpse_fails = ["no frame"] * 2 * POSES
-    assert await recorded(rig) == [None] * POSES
-    assert len(rig.told("camera")) == POSES
-
-
-async def test_one_bad_glimpse_is_looked_at_again(rig: Rig) -> None:
-    rig.camera.glimpse_fails = ["incomplete"]
-    assert await recorded(rig) == [0.0] * POSES
 
 
 async def test_stop_leaves_the_camera_free(rig: Rig) -> None:

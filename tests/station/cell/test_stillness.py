@@ -36,16 +36,17 @@ def monitor(**limits: float) -> StillnessMonitor:
     return StillnessMonitor(StillnessConfig(**limits))
 
 
-def shake(found: StillnessMonitor, seconds: float, amplitude_rad: float, frequency_hz: float = 8.0) -> None:
+def shaken(amplitude_rad: float, seconds: float = 0.5, **limits: float) -> StillnessMonitor:
+    """It has seen joint 2 shake eight times a second for so long."""
+    found, rad_s = monitor(**limits), 2 * math.pi * 8.0
     for i in range(int(seconds * 125)):
-        phase = 2 * math.pi * frequency_hz * i * 0.008
-        speed = amplitude_rad * 2 * math.pi * frequency_hz * math.cos(phase)
-        found.add(state(i * 0.008, amplitude_rad * math.sin(phase), speed))
+        phase = rad_s * i * 0.008
+        found.add(state(i * 0.008, amplitude_rad * math.sin(phase), amplitude_rad * rad_s * math.cos(phase)))
+    return found
 
 
 def test_a_resting_arm_is_still() -> None:
-    m = monitor()
-    shake(m, 0.5, 0.0)
+    m = shaken(0.0)
     found = m.measure()
     assert found is not None and m.unrest(found) == ""
     assert m.at_rest
@@ -55,8 +56,7 @@ def test_a_resting_arm_is_still() -> None:
 
 
 def test_a_shaking_arm_is_measured() -> None:
-    m = monitor()
-    shake(m, 0.5, 0.001)
+    m = shaken(0.001)
     found = m.measure()
     assert found.max_joint_speed_rad_s == pytest.approx(0.001 * 2 * math.pi * 8, rel=0.02)
     radius_m = math.hypot(0.5723 + 0.1157, 0.612)  # of the flange about the shoulder, roughly
@@ -97,37 +97,21 @@ def test_a_flange_that_only_turns_on_the_spot_is_no_rest() -> None:
     ],
 )
 def test_flange_and_picture_have_a_say(measured: dict[str, float], said: str) -> None:
-    m = monitor()
-    shake(m, 0.5, 0.0)
+    m = shaken(0.0)
     found = m.measure()
     assert m.unrest(msgspec.structs.replace(found, **measured)) == said
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.1, 0.25])
-def test_a_short_look_is_no_measurement(seconds: float) -> None:
-    m = monitor()
-    shake(m, seconds, 0.0)
-    assert m.measure() is None
-
-
-def test_a_hole_in_the_stream_is_no_measurement() -> None:
-    m = monitor()
-    for i in range(60):
-        if not 40 < i < 56:
-            m.add(state(i * 0.008))
-    assert m.measure() is None
-
-
-def test_a_controller_restart_begins_a_new_window() -> None:
-    m = monitor()
-    shake(m, 0.5, 0.0)
-    m.add(state(0.008))
-    assert m.measure() is None
+def test_a_short_look_a_hole_in_the_stream_and_a_restart_of_the_controller_are_no_measurement() -> None:
+    found = [shaken(0.0, seconds) for seconds in (0.0, 0.1, 0.25, 0.5, 0.33)]
+    found[3].add(state(0.008))
+    for i in range(56, 60):
+        found[4].add(state(i * 0.008))
+    assert [m.measure() for m in found] == [None] * 5
 
 
 async def test_settling_returns_as_soon_as_the_arm_rests() -> None:
-    m = monitor(timeout_s=5.0)
-    shake(m, 0.5, 0.01)
+    m = shaken(0.01, timeout_s=5.0)
     polls = 0
 
     def alive() -> bool:
@@ -149,8 +133,7 @@ async def test_an_arm_that_never_rests_is_given_up_with_the_reason(
     shaken_rad: float, alive: bool | None, looked: float | None, code: str
 ) -> None:
     """A camera that shows nothing is not called a shake."""
-    m = monitor(timeout_s=5.0)
-    shake(m, 0.5, shaken_rad)
+    m = shaken(shaken_rad, timeout_s=5.0)
     clock = iter([0.0, 1.0, 5.1])
     with raises(code, NotStillError, limit_s=5.0) as told:
         await m.settle(lambda: alive, lambda since_ns: looked, now_s=lambda: next(clock))
@@ -160,8 +143,7 @@ async def test_an_arm_that_never_rests_is_given_up_with_the_reason(
 
 
 async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:
-    m = monitor(timeout_s=5.0)
-    shake(m, 0.5, 0.01)
+    m = shaken(0.01, timeout_s=5.0)
     clock = iter([0.0, 1.0, 5.1])
     settling = asyncio.ensure_future(m.settle(lambda: True, now_s=lambda: next(clock)))
     await asyncio.sleep(0)
@@ -170,8 +152,7 @@ async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:
 
 
 async def test_old_news_of_an_arm_at_rest_are_no_rest() -> None:
-    m = monitor(timeout_s=5.0)
-    shake(m, 0.5, 0.0)
+    m = shaken(0.0, timeout_s=5.0)
     news = iter([None, None, True])
     asked: list[bool | None] = []
 

@@ -41,14 +41,11 @@ def idle(**fields: Any) -> StationStatus:
     return StationStatus(state=StationState.IDLE, camera=CAMERA, **fields)
 
 
-def test_a_cell_is_ready_when_its_devices_are_there_and_the_joints_are_known() -> None:
-    ready = idle(robot=STANDING)
+@pytest.mark.parametrize("ready", [idle(robot=STANDING), idle(playback=True)])
+def test_a_cell_is_ready_when_its_devices_are_there_and_joints_known_but_for_a_playback(
+    ready: StationStatus,
+) -> None:
     assert waited(StationStatus(), idle(), ready) is ready
-
-
-def test_a_playback_needs_no_joints() -> None:
-    ready = idle(playback=True)
-    assert waited(StationStatus(), ready) is ready
 
 
 @pytest.mark.parametrize(

@@ -45,15 +45,6 @@ def test_an_image_counts_until_another_takes_its_place() -> None:
     assert (queue.done, queue.status(1).kept) == (1, False)
 
 
-@pytest.mark.parametrize("state", ["done", "skipped", "failed", "moving", "settling", "capturing", "writing"])
-def test_after_a_restart_only_what_ended_counts(state: PoseState) -> None:
-    queue = queue_of()
-    queue.mark(2, state, "because")
-    again = PoseQueue(queue.plan, queue.statuses)
-    assert again.status(2).state == (state if state in ("done", "skipped", "failed") else "planned")
-    assert again.sha256 == queue.sha256
-
-
 def test_another_session_leaves_out_what_was_left_out_and_on_wish_what_a_hand_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

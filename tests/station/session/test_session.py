@@ -105,18 +105,6 @@ async def test_a_pose_counts_only_once_it_is_on_the_disk(rig: Rig, held_disk: He
     assert rig.pose_states == ["done"] * POSES
 
 
-async def test_pause_is_after_this_pose_and_going_on_needs_a_new_go(rig: Rig) -> None:
-    await rig.go_until_it_moves()
-    await rig.pause_after_this_pose("bert")
-    assert rig.pose_states == ["done", "planned", "planned", "planned"]
-    assert rig.cause == "paused" and "bert" in rig.session.store.status.reason
-    await asyncio.sleep(0.05)
-    assert rig.arm.log.count("move") == 1
-    rig.arm.slow = False
-    await rig.go_until(S.IDLE, purpose=Purpose.RESUME)
-    assert len(sealed(rig).views()) == POSES
-
-
 @pytest.mark.parametrize("phase", [*WHOLE_POSE, S.SEALING])
 async def test_stop_in_every_phase_is_latched_and_keeps_what_was_taken(rig: Rig, phase: S) -> None:
     stopped = asyncio.Event()
@@ -168,14 +156,6 @@ async def test_the_end_of_control_in_mid_move_stops_the_arm_at_once(rig: Rig, ho
     await rig.session.go(2, summary.token)
     await rig.until(S.IDLE)
     assert len(sealed(rig).views()) == POSES
-
-
-async def test_finish_seals_what_is_there(rig: Rig) -> None:
-    await rig.go_until_it_moves()
-    await rig.session.finish(1)
-    rig.arm.arrive.set()
-    await rig.until(S.IDLE)
-    assert len(sealed(rig).views()) == 1
 
 
 async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_plan: Plan) -> None:

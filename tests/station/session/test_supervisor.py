@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import msgspec
 import pytest
 
@@ -10,7 +12,7 @@ from station.devices.rtde import RobotMode, SafetyMode
 from station.protocol.verbs import Purpose
 from station.session import supervisor
 from tests.patience import until
-from tests.station.session_rig import NewRig, Rig
+from tests.station.session_rig import POSES, NewRig, Rig, sealed
 
 
 async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(rig: Rig) -> None:
@@ -21,9 +23,15 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
     rig.arm.arrive.set()
     await rig.until(S.PAUSED)
     await until(lambda: rig.session.store.status.pending == "")
+    assert rig.pose_states == ["done", *["planned"] * (POSES - 1)] and rig.cause == "paused"
+    await asyncio.sleep(0.05)
+    assert rig.arm.log.count("move") == 1, "going on needs a new go"
     await rig.go_until(S.MOVING, purpose=Purpose.RESUME)
     await rig.session.finish(1)
     await until(lambda: rig.session.store.status.pending == supervisor.FINISHES)
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == 2
 
 
 async def test_what_holds_an_arm_at_rest_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

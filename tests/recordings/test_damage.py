@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError
-from recordings.reader import Recording, open_recording
+from recordings.reader import open_recording
 from recordings.recover import recover_recording
-from recordings.schema.messages import RobotState, View
 from tests.recordings.small_recording import make_state, make_view
 
 
@@ -43,17 +42,6 @@ def test_a_cut_file_is_refused_and_names_recover(small: Path, every: int) -> Non
             open_recording(cut)
 
 
-def assert_part_of_the_original(recording: Recording) -> tuple[int, int]:
-    """Whatever was saved is exactly what was written."""
-    views: list[View] = recording.views()
-    assert views == [make_view(view.index) for view in views]
-    states: list[RobotState] = list(recording.robot_states())
-    assert all(state in [make_state(i) for i in range(9)] for state in states)
-    for view, picture in recording.images():
-        assert picture.sequence == view.picture_sequence
-    return len(views), len(states)
-
-
 @sampled(293)
 def test_recovery_of_a_cut_file_saves_every_pose_that_is_in_it(small: Path, every: int) -> None:
     """Each finished pose whose bytes are in the file comes back; more bytes never save less."""
@@ -68,7 +56,12 @@ def test_recovery_of_a_cut_file_saves_every_pose_that_is_in_it(small: Path, ever
             assert error.code == "nothing-to-save"
             assert saved_before == (0, 0)
             continue
-        saved = assert_part_of_the_original(open_recording(output))
+        recording = open_recording(output)
+        views, states = recording.views(), list(recording.robot_states())
+        assert views == [make_view(view.index) for view in views], "exactly what was written"
+        assert all(state in [make_state(i) for i in range(9)] for state in states)
+        assert all(picture.sequence == view.picture_sequence for view, picture in recording.images())
+        saved = len(views), len(states)
         assert (result.poses, result.robot_states) == saved
         assert saved >= saved_before
         saved_before = saved

@@ -6,6 +6,7 @@ Each weakness is what an acceptance test of the arm must find.
 from __future__ import annotations
 
 import sys
+from math import copysign
 from typing import Any
 
 from station.devices.rtde import SafetyMode
@@ -50,7 +51,7 @@ class WeakArm(SimulatedArm):
 
 
 class WeakRobot(SimulatedRobot):
-    weakness = ""
+    weakness, last_speed = "", 0.0
 
     def __init__(self, *settings: Any) -> None:
         super().__init__(*settings)
@@ -71,15 +72,9 @@ class WeakRobot(SimulatedRobot):
         q = arm.command
         if self.weakness == "swings-back":
             arm.braked = False
-            arm.start((q[0] - BACK_RAD * self._way, *q[1:]), 0.1, 1.4)
+            arm.start((q[0] - copysign(BACK_RAD, self.last_speed), *q[1:]), 0.1, 1.4)
         elif self.weakness == "drifts-at-rest":
             arm.command = (q[0] + DRIFT_RAD_S * self.dt_s, *q[1:])
-
-    @property
-    def _way(self) -> float:
-        return 1.0 if self.last_speed >= 0 else -1.0
-
-    last_speed = 0.0
 
     def stop_program(self, reason: str) -> None:
         arm = self.arm
@@ -103,9 +98,7 @@ def weak(weakness: str) -> type[WeakRobot]:
 
 def main(arguments: list[str]) -> int:
     at = arguments.index("--weakness")
-    kind = weak(arguments[at + 1])
-
-    vars(machine)["SimulatedRobot"] = kind
+    vars(machine)["SimulatedRobot"] = weak(arguments[at + 1])
     return __main__.main([*arguments[:at], *arguments[at + 2 :]])
 
 

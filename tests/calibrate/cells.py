@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -121,7 +122,7 @@ def nudged(views: ViewSet, places: list[int], deltas: Array) -> ViewSet:
     return with_flange(views, flange)
 
 
-def changed(views: ViewSet, places: list[int], **fields) -> ViewSet:
+def changed(views: ViewSet, places: list[int], **fields: Any) -> ViewSet:
     """The views, at these places with fields replaced by functions of the old view."""
     out: list[BoardView] = list(views.views)
     for i in places:

@@ -27,7 +27,7 @@ from calibrate.job import single_threaded_opencv, solve_recording
 from recordings.errors import ImportSourceError
 from recordings.importers.dataset import Dataset, read_dataset, read_poses
 from recordings.importers.folder import write_views
-from recordings.importers.tables import Lies, Table
+from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import Mount
 
 SETS = ("charuco-eye-to-hand", "rendered-truth", "abb-circles", "curved-board", "ur3a-two-swapped")
@@ -78,30 +78,30 @@ def numbers(how: str, T: Array) -> Array:
     return np.hstack([at, turn])
 
 
-def said(case: Misread, T: Array, mount: Mount, lies: Lies) -> str:
+def said(case: Misread, T: Array, mount: Mount, held: Contents) -> str:
     """Answer of the import; of other poses than the true ones `gates` (the solve refuses them) or `wrong`."""
     rows = numbers(case.written, case.change(T))
-    lies.tables = [Table(case.name, "", rows, [""] * len(rows), [(n,) for n in range(len(rows))])]
+    held.tables = [Table(case.name, "", rows, [""] * len(rows), [(n,) for n in range(len(rows))])]
     others: dict[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
     try:
-        found = believe(lies, Given(case.told, others[mount] if case.other_mount else mount))
+        found = believe(held, Given(case.told, others[mount] if case.other_mount else mount))
     except ImportSourceError as error:
         return str(error.values.get("cause") or error.code)
     got = np.array([row.base_from_flange for row in found.rows])
     if np.allclose(got, T, atol=1e-3) and found.dataset.mount == mount:
         return "read"
     with tempfile.TemporaryDirectory() as folder:
-        write_views(lies.root, recording := Path(folder) / "r.mcap", found.dataset, found.rows, {})
+        write_views(held.root, recording := Path(folder) / "r.mcap", found.dataset, found.rows, {})
         with suppress(CalibrationError):
             return "wrong" if solve_recording(recording).passed else "gates"
         return "solver"
 
 
-def cases_of(folder: Path) -> tuple[Array, Dataset, Lies]:
+def cases_of(folder: Path) -> tuple[Array, Dataset, Contents]:
     """(poses, description, images that lie there) of a set in our own format."""
     rows, told = read_poses(folder)[0], read_dataset(folder / "dataset.yaml")[0]
-    lies = Lies(folder, {"images/#": [folder / row.image for row in rows]})
-    return np.array([row.base_from_flange for row in rows]), told, lies
+    held = Contents(folder, {"images/#": [folder / row.image for row in rows]})
+    return np.array([row.base_from_flange for row in rows]), told, held
 
 
 @single_threaded_opencv()
@@ -109,10 +109,10 @@ def run() -> str:
     """Every mistake on every set; a board is looked for once a set."""
     rows, counted = [], Counter[str]()
     for name in filter(None, os.environ.get("BENCH_SETS", ",".join(SETS)).split(",")):
-        T, told, lies = cases_of(DATASETS / name)
-        seen = board.see_board(lies, told.board, lies.images["images/#"], lambda *_: None)
+        T, told, held = cases_of(DATASETS / name)
+        seen = board.see_board(held, told.board, held.images["images/#"], lambda *_: None)
         with patch("calibrate.imported.folder.see_board", return_value=seen):
-            answers = {what: said(case, T, told.mount, lies) for what, case in MISREAD.items()}
+            answers = {what: said(case, T, told.mount, held) for what, case in MISREAD.items()}
         counted["right"] += sum(answers[what] in case.says.split() for what, case in MISREAD.items())
         counted.update(answers.values())
         rows += [[name, what, answer, MISREAD[what].says] for what, answer in answers.items()]

@@ -25,7 +25,7 @@ from recordings.importers.folder import Imported, import_folder, write_views
 from recordings.importers.messages import Progress
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import StandstillLimits
-from recordings.importers.tables import Lies, look
+from recordings.importers.tables import Contents, look
 from recordings.plain_text import plain_text
 from recordings.schema.messages import Mount
 from recordings.schema.stillness import POSITION_M, ROTATION_RAD
@@ -95,10 +95,10 @@ def import_command(
         if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
         elif source.exists() and not any(path.suffix in BAGS for path in [source, *source.glob("*")]):
-            lies = look(source, poses)
-            told = read_dataset(dataset)[0] if dataset else _told(lies.root, output)
+            held = look(source, poses)
+            told = read_dataset(dataset)[0] if dataset else _told(held.root, output)
             given = Given(convention, mount, None if board is None else typed_board(board))
-            done = _import_found(lies, target, told, given, progress)
+            done = _import_found(held, target, told, given, progress)
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
@@ -123,13 +123,13 @@ def _told(source: Path, output: Path | None) -> Dataset | None:
 
 @single_threaded_opencv()
 def _import_found(
-    lies: Lies, target: Path | None, told: Dataset | None, given: Given, progress: Progress
+    held: Contents, target: Path | None, told: Dataset | None, given: Given, progress: Progress
 ) -> Imported:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
-    believed = believe(lies, given, told, progress)
+    believed = believe(held, given, told, progress)
     dataset = believed.dataset
     content = msgspec.yaml.encode(dataset)
-    done = write_views(lies.root, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
+    done = write_views(held.root, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
     if target is not None and dataset != told:
         write_atomically(target.with_suffix("." + DATASET_FILE), content)
     return replace(done, facts=believed.facts)

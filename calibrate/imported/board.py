@@ -30,7 +30,7 @@ from recordings.files import read_file
 from recordings.images import IMAGE_LIMIT_BYTES, ImageError, decode_image, read_header
 from recordings.importers.conventions import Convention, possible
 from recordings.importers.messages import Progress
-from recordings.importers.tables import Lies, Table
+from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 
 FEWEST = 5
@@ -96,7 +96,7 @@ def _spread(count: int, most: int) -> list[int]:
     return list(map(int, np.linspace(0, count - 1, min(count, most))))
 
 
-def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: Progress) -> Seen | None:
+def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progress: Progress) -> Seen | None:
     """Find the board in evenly spread images; None: in too few. ImportSourceError where none can be read."""
     images: dict[Path, Grey] = {}
     sizes = set[tuple[int, int]]()
@@ -115,7 +115,7 @@ def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: 
     factor = min(1.0, _LARGEST_SIDE_PX / max(width, height))
     small = {path: _reduced(image, factor) for path, image in images.items()}
     greys = list(small.values())
-    boards = [(given, None)] if given else chain(_described(lies.facts), _shown(greys))
+    boards = [(given, None)] if given else chain(_described(held.facts), _shown(greys))
     for board, known in _likely(boards, greys[:_TRIED], progress)[:2]:
         points = board_points(board)
         found = dict(_search(small, board, known, progress))
@@ -132,7 +132,7 @@ def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: 
         }
         if len(views) < FEWEST:
             continue
-        camera = _camera(lies, CameraModel(width, height), tuple(views.values()))
+        camera = _camera(held, CameraModel(width, height), tuple(views.values()))
         if camera is not None:
             candidates = {path: candidate_poses(view, camera[0], board) for path, view in views.items()}
             return Seen(board, known, views, candidates, *camera, len(images), greys)
@@ -191,12 +191,14 @@ def _likely(
     return [(board, known) for _, board, known in sorted(counted, key=lambda c: c[0])]
 
 
-def _camera(lies: Lies, blank: CameraModel, views: tuple[BoardView, ...]) -> tuple[CameraModel, bool] | None:
+def _camera(
+    held: Contents, blank: CameraModel, views: tuple[BoardView, ...]
+) -> tuple[CameraModel, bool] | None:
     """(the lens by these images, False); (the one that was told, True) where they do not determine one."""
     own: CameraModel | None = None
     with suppress(CalibrationError):
         own = calibrate_intrinsics(ViewSet("eye-in-hand", views, blank)).camera
-    for K, distortion in lies.cameras[:1] if own is None or len(views[0].pixels) < 12 else ():
+    for K, distortion in held.cameras[:1] if own is None or len(views[0].pixels) < 12 else ():
         matrix: Any = tuple(map(tuple, K.tolist()))
         return msgspec.structs.replace(blank, matrix=matrix, distortion=distortion), True
     return None if own is None else (own, False)

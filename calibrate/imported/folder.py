@@ -16,7 +16,7 @@ from recordings.errors import ImportSourceError
 from recordings.importers.conventions import NAMED, Convention, convention
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
 from recordings.importers.messages import Progress
-from recordings.importers.tables import Lies, Table, natural
+from recordings.importers.tables import Contents, Table, natural
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount
 
 _MADE = re.compile(r"draw|calibrated|overlay|visual|detect|result|undist|depth|corner|IR\b|axes", re.I)
@@ -51,7 +51,7 @@ def is_described(folder: Path, *given: object) -> bool:
 
 
 def believe(
-    lies: Lies,
+    held: Contents,
     given: Given = Given(),
     told: Dataset | None = None,
     progress: Progress = lambda done, total, text: None,
@@ -63,28 +63,28 @@ def believe(
     """
     if told is not None:
         if told.poses is not None and given == Given():
-            return _as_before(lies, told, told.poses)
+            return _as_before(held, told, told.poses)
         given = Given(given.convention, given.mount or told.mount, given.board or told.board)
-    named, unnamed = ([t for t in lies.tables if t.whose == whose] for whose in ("robot", ""))
-    robots = (named or unnamed) if lies.told is None else lies.told
+    named, unnamed = ([t for t in held.tables if t.whose == whose] for whose in ("robot", ""))
+    robots = (named or unnamed) if held.told is None else held.told
     boards = [
         (robot, board, pairs)
         for robot in robots
-        for board in lies.tables
-        if (board.whose == "board" or (lies.told and board in unnamed)) and board not in robots
+        for board in held.tables
+        if (board.whose == "board" or (held.told and board in unnamed)) and board not in robots
         if len(pairs := _pairs(robot, board)) >= FEWEST
     ]
     tried: list[TableReading] = []
     families: list[str] = []
     seen: Seen | None = None
-    for family in sorted(lies.images, key=lambda name: (bool(_MADE.search(name)), name)):
-        paired = [(table, _pairs(table, lies.images[family])) for table in robots]
+    for family in sorted(held.images, key=lambda name: (bool(_MADE.search(name)), name)):
+        paired = [(table, _pairs(table, held.images[family])) for table in robots]
         paths = {path for _, pairs in paired if len(pairs) >= FEWEST for path in pairs}
         if not paths:
             continue
         families.append(family)
         images = sorted((path for path in paths if isinstance(path, Path)), key=natural)
-        if (seen := see_board(lies, given.board, images, progress)) is not None:
+        if (seen := see_board(held, given.board, images, progress)) is not None:
             for table, pairs in paired:
                 tried += table_readings(table, family, pairs, [seen], given.convention)
         if any(map(is_good, tried)):
@@ -94,26 +94,26 @@ def believe(
             progress(n, len(boards), "comparing tables of poses")
             tried += table_readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
     if not tried and (seen or not families):
-        there = [f"{len(paths)} {name}" for name, paths in lies.images.items()]
-        there += [f"{name}, to be unpacked first" for name in lies.packed]
-        tables = [f"{len(table.numbers)} {table.name}" for table in lies.tables]
+        there = [f"{len(paths)} {name}" for name, paths in held.images.items()]
+        there += [f"{name}, to be unpacked first" for name in held.packed]
+        tables = [f"{len(table.numbers)} {table.name}" for table in held.tables]
         said = [", ".join(each[:8]) or "none" for each in (there, tables)]
-        raise ImportSourceError("no-pairs", source=lies.root, images=said[0], tables=said[1])
+        raise ImportSourceError("no-pairs", source=held.root, images=said[0], tables=said[1])
     if not tried:
-        raise ImportSourceError("no-board-found", source=lies.root, images=", ".join(families))
-    return _believed(lies, given, decide(lies, tried, given.convention, given.mount))
+        raise ImportSourceError("no-board-found", source=held.root, images=", ".join(families))
+    return _believed(held, given, decide(held, tried, given.convention, given.mount))
 
 
-def _as_before(lies: Lies, told: Dataset, poses: PosesTold) -> Believed:
-    tables = {table.name: table for table in lies.tables}
+def _as_before(held: Contents, told: Dataset, poses: PosesTold) -> Believed:
+    tables = {table.name: table for table in held.tables}
     table, board = tables.get(poses.table), tables.get(poses.images) if poses.board_convention else None
-    if table is None or not (pairs := _pairs(table, board or lies.images.get(poses.images, []))):
-        raise ImportSourceError("no-pairs", source=lies.root, images=poses.images, tables=poses.table)
+    if table is None or not (pairs := _pairs(table, board or held.images.get(poses.images, []))):
+        raise ImportSourceError("no-pairs", source=held.root, images=poses.images, tables=poses.table)
     seen = None if board is None else (board, convention(poses.board_convention))
     joints = tables.get(poses.joints)
     if poses.joints and (joints is None or len(joints.numbers) != len(table.numbers)):
-        raise ImportSourceError("joints-rows", source=lies.root, joints=poses.joints, poses=poses.table)
-    return Believed(told, _rows(lies, table, convention(poses.convention), pairs, seen, joints))
+        raise ImportSourceError("joints-rows", source=held.root, joints=poses.joints, poses=poses.table)
+    return Believed(told, _rows(held, table, convention(poses.convention), pairs, seen, joints))
 
 
 def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
@@ -139,12 +139,12 @@ def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
     return shared if unique and len(shared) > 0.8 * max(len(rows), len(paths)) else {}
 
 
-def _believed(lies: Lies, given: Given, best: TableReading) -> Believed:
+def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
     seen, pairs = best.seen, best.pairs
-    joints, by_joints = joints_of(lies, best) or (None, None)
+    joints, by_joints = joints_of(held, best) or (None, None)
     # A maker's convention is the tool in the base; a spelt one tells the direction only if inverse.
     as_told = given.convention in NAMED or (given.convention or "").endswith("-inverse")
-    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, as_told, by_joints)
+    mount, inverted, board_inverted, why = mounting(held, given.mount, best, as_told, by_joints)
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)
     facts = {
@@ -164,13 +164,13 @@ def _believed(lies: Lies, given: Given, best: TableReading) -> Believed:
     saw = None
     if seen.convention is not None:
         how_board = replace(seen.convention, inverse=seen.convention.inverse != board_inverted)
-        saw = next(t for t in lies.tables if t.name == best.family), how_board
+        saw = next(t for t in held.tables if t.name == best.family), how_board
         del facts["images"], facts["camera"]
         facts["board"] = f"{len(pairs)} rows of {best.family}", f"{how_board.name}; {seen.told}"
     seen_how, moved_by = saw[1].name if saw else "", joints.name if joints else ""
-    told = PosesTold(best.table.name, best.family, how.name, seen_how, moved_by, str(lies.root.resolve()))
-    dataset = Dataset(mount, board, camera, lies.root.resolve().name, poses=told)
-    return Believed(dataset, _rows(lies, best.table, how, pairs, saw, joints), facts)
+    told = PosesTold(best.table.name, best.family, how.name, seen_how, moved_by, str(held.root.resolve()))
+    dataset = Dataset(mount, board, camera, held.root.resolve().name, poses=told)
+    return Believed(dataset, _rows(held, best.table, how, pairs, saw, joints), facts)
 
 
 def _board(best: TableReading) -> tuple[BoardSpec, str]:
@@ -189,7 +189,7 @@ def _board(best: TableReading) -> tuple[BoardSpec, str]:
 
 
 def _rows(
-    lies: Lies,
+    held: Contents,
     table: Table,
     how: Convention,
     pairs: dict[Key, int],
@@ -203,7 +203,7 @@ def _rows(
     return [
         PoseRow(
             n + 1,
-            f"row {key + 1}" if isinstance(key, int) else str(key.relative_to(lies.root)),
+            f"row {key + 1}" if isinstance(key, int) else str(key.relative_to(held.root)),
             _matrix(flanges[n]),
             None if joints is None else tuple(joints_rad(joints)[pairs[key]].tolist()),
             None if boards is None else _matrix(boards[n]),

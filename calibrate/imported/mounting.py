@@ -19,7 +19,7 @@ from calibrate.geometry import Array, inverse
 from calibrate.imported.scenery import mount_by_scene
 from calibrate.imported.table_readings import TableReading
 from recordings.errors import ImportSourceError
-from recordings.importers.tables import Lies, Table
+from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import Mount
 
 _MOST_ROWS = 100
@@ -48,7 +48,7 @@ _CAMERA_IN_BOARD = re.compile(r"cam\w*?_?(2|to|in|wrt)_?(board|target|marker|obj
 
 
 def mounting(
-    lies: Lies, given: Mount | None, best: TableReading, as_told: bool, by_joints: bool | None
+    held: Contents, given: Mount | None, best: TableReading, as_told: bool, by_joints: bool | None
 ) -> tuple[Mount, bool, bool, str]:
     """(mounting, whether the robot's poses are inverted, whether the board's are, why).
 
@@ -68,8 +68,8 @@ def mounting(
         by_distances, far_apart = _inverted_by_distances(best)
         straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
         turned = inverted if straight != inverted else None
-        facts = " ".join(f"{key} {str(value).lower()}" for key, value in lies.facts.items())
-        named = _named(f"{name} {best.family}") or _named(f"{lies.words} {facts}")
+        facts = " ".join(f"{key} {str(value).lower()}" for key, value in held.facts.items())
+        named = _named(f"{name} {best.family}") or _named(f"{held.words} {facts}")
         images = [(seen.images[view.index], view) for view in best.views] if seen.images else []
         names, scene = by_turn[turned] | named, mount_by_scene(images, seen.camera)
         evidence = {"names": names, "the scene around the board": scene, far_apart: by_turn[by_distances]}
@@ -80,7 +80,7 @@ def mounting(
     if len(possible) != 1:
         said = "; ".join(f"{' or '.join(sorted(says))} by {what}" for what, says in why)
         raise ImportSourceError(
-            "which-mount", source=lies.root, mount=fits, table=name, said=said or "nothing tells which"
+            "which-mount", source=held.root, mount=fits, table=name, said=said or "nothing tells which"
         )
     (mount,) = possible
     by = "as told" if given else f"by {', '.join(what for what, _ in why)}; {name}"
@@ -98,13 +98,13 @@ def _inverted_by_distances(best: TableReading) -> tuple[bool | None, str]:
     return (carried > stands if clear else None), f"{near:.2f} m from the flange, {far:.2f} m from the base"
 
 
-def joints_of(lies: Lies, best: TableReading) -> tuple[Table, bool] | None:
+def joints_of(held: Contents, best: TableReading) -> tuple[Table, bool] | None:
     """(table of the arm's joints, whether they move axes as the inverses of the poses do); None: none tells.
 
     An arm's flange is a product of turns in the order of its joints; of its inverse the order is reversed.
     """
     flanges = best.convention.poses(best.table.numbers[:_MOST_ROWS])
-    for table in lies.tables:
+    for table in held.tables:
         joints = joints_rad(table)[:_MOST_ROWS]
         rows, count = joints.shape
         if count > 7 or rows < 2 * count or len(table.numbers) != len(best.table.numbers):

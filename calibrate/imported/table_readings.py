@@ -22,7 +22,7 @@ from calibrate.lens.pnp import choose_candidates
 from calibrate.views import ViewSet
 from recordings.errors import ImportSourceError
 from recordings.importers.conventions import Convention, convention, possible
-from recordings.importers.tables import Lies, Table
+from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import Mount
 
 _AS_TOLD = "as told"
@@ -159,7 +159,9 @@ def is_good(reading: TableReading) -> bool:
     )
 
 
-def decide(lies: Lies, readings: list[TableReading], named: str | None, mount: Mount | None) -> TableReading:
+def decide(
+    held: Contents, readings: list[TableReading], named: str | None, mount: Mount | None
+) -> TableReading:
     """The reading that is clearly best. What the user names is refused where another one is clearly better;
     whose mounting and convention are told needs not agree well: the solve judges it."""
     ranked = sorted(readings, key=lambda r: (not is_good(r), -r.fit.log_evidence))
@@ -167,18 +169,18 @@ def decide(lies: Lies, readings: list[TableReading], named: str | None, mount: M
     beaten = mine and _beats(ranked[0], mine[0])
     if beaten and is_good(ranked[0]):
         fits = replace(ranked[0].convention, inverse=mount not in (None, ranked[0].mount)).name
-        raise ImportSourceError("other-convention", source=lies.root, told=named, fits=fits)
+        raise ImportSourceError("other-convention", source=held.root, told=named, fits=fits)
     if not mine or beaten or not is_good(mine[0]):
         nearest = _nearest([*dict.fromkeys(ranked[:_EXPLAINED] + mine[:_EXPLAINED])])
         if not mine or beaten or not (named and mount) or nearest["cause"]:
-            raise ImportSourceError("no-reading", source=lies.root, **nearest)
+            raise ImportSourceError("no-reading", source=held.root, **nearest)
     best = mine[0]
     for other in mine[1:]:
         if _beats(best, other) or is_good(other) != is_good(best):
             break
         if not _same(best, other):
             both = {"first": best.text, "second": other.text}
-            raise ImportSourceError("two-readings", source=lies.root, **both)
+            raise ImportSourceError("two-readings", source=held.root, **both)
     return best
 
 

@@ -74,8 +74,8 @@ class Table:
 
 
 @dataclass
-class Lies:
-    """All that was found."""
+class Contents:
+    """What a folder holds."""
 
     root: Path
     images: dict[str, list[Path]] = field(default_factory=dict)
@@ -101,14 +101,14 @@ class _Row:
     told: bool
 
 
-def look(source: Path, poses: Path | None = None) -> Lies:
+def look(source: Path, poses: Path | None = None) -> Contents:
     """Read what lies in a folder, or one file.
 
     `poses` tells the robot's: a file, a folder or the end of their names.
     """
     root = source if source.is_dir() else source.parent
     file = poses if poses is None or poses.exists() else root / poses
-    found, words = Lies(root, told=None if poses is None else []), ["/".join(source.resolve().parts[-3:])]
+    found, words = Contents(root, told=None if poses is None else []), ["/".join(source.resolve().parts[-3:])]
     rows = defaultdict[tuple[str, ...], list[_Row]](list)
     files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
     for path in files if file is None or file.is_relative_to(root) else [*files, file]:
@@ -301,7 +301,7 @@ def _half_of(word: str) -> str | None:
     return next((half for half, (words, _) in _HALVES.items() if words.fullmatch(word.strip("#"))), None)
 
 
-def _facts(node: _Node, found: Lies) -> None:
+def _facts(node: _Node, found: Contents) -> None:
     """Note a camera's matrix, by its form, and what describes a board."""
     numbers = _flat(node.value) if isinstance(node.value, (list, dict)) else None
     key = node.keys[-1].lower() if node.keys else ""

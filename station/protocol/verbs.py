@@ -198,7 +198,7 @@ class GetPlan(Verb[LoadedPlan], frozen=True):
 
 
 class LoadPlan(Verb[Done], frozen=True):
-    """Load a plan, checked; refused with all its problems."""
+    """Load a plan. `prepare` checks the whole of it, from where the arm is then."""
 
     states = _LOADING
     moves = True

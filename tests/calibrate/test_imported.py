@@ -69,10 +69,10 @@ def put(
         write(folder, change(images[1]))
         return folder
 
-    def seen(lies, given, paths, progress):
-        key = (given, json.dumps(lies.facts), len(paths))
+    def seen(held, given, paths, progress):
+        key = (given, json.dumps(held.facts), len(paths))
         if key not in _SEEN:
-            _SEEN[key] = board.see_board(lies, given, paths, progress)
+            _SEEN[key] = board.see_board(held, given, paths, progress)
         found = _SEEN[key]
         renamed = {path.name: path for path in paths}
         views = {renamed[path.name]: view for path, view in found.views.items()}
@@ -116,15 +116,15 @@ def test_poses_are_found_in_whatever_holds_them(write: Write, tmp_path: Path) ->
 
 def test_what_nothing_tells_is_asked(put: Callable[..., Path], images: tuple[Path, np.ndarray]) -> None:
     """A camera in hand looks like a fixed one with inverted poses."""
-    lies, told = look(put(unnamed, of_a_frame_at_the_table)), of_a_frame_at_the_table(images[1])
+    held, told = look(put(unnamed, of_a_frame_at_the_table)), of_a_frame_at_the_table(images[1])
     with raises("which-mount", mount="eye-in-hand"):
-        believe(lies)
+        believe(held)
     with raises("which-mount"):
-        believe(lies, Given("euler-ZYX-deg-mm"))
-    assert believe(lies, Given("kuka-abc")).dataset.mount == "eye-in-hand"  # always the tool in the base
-    straight = believe(lies, Given(mount="eye-in-hand"))
+        believe(held, Given("euler-ZYX-deg-mm"))
+    assert believe(held, Given("kuka-abc")).dataset.mount == "eye-in-hand"  # always the tool in the base
+    straight = believe(held, Given(mount="eye-in-hand"))
     np.testing.assert_allclose([row.base_from_flange for row in straight.rows], told, atol=1e-6)
-    turned = np.array([row.base_from_flange for row in believe(lies, Given(mount="eye-to-hand")).rows])
+    turned = np.array([row.base_from_flange for row in believe(held, Given(mount="eye-to-hand")).rows])
     np.testing.assert_allclose(turned, np.linalg.inv(told), atol=1e-6)
 
 
@@ -302,14 +302,14 @@ def test_one_of_two_tables_is_named_the_robots_and_a_reading_told_whole_is_taken
         (tmp_path / "tcp_pose.txt").rename(tmp_path / "a.txt")
         with raises("no-pairs"):
             believe(look(tmp_path))
-        lies = look(tmp_path, Path("a.txt"))
+        held = look(tmp_path, Path("a.txt"))
         if noise_m:
             with raises("no-reading", nearest="a.txt: eye-in-hand, rotvec"):
-                believe(lies, Given(mount="eye-in-hand"))
-        found = believe(lies, Given("ur-rotvec", "eye-in-hand"))
+                believe(held, Given(mount="eye-in-hand"))
+        found = believe(held, Given("ur-rotvec", "eye-in-hand"))
         np.testing.assert_allclose([row.base_from_flange for row in found.rows], robot, atol=1e-6)
         with raises("no-reading" if noise_m else "other-convention"):
-            believe(lies, Given("euler-ZYX", "eye-in-hand"))
+            believe(held, Given("euler-ZYX", "eye-in-hand"))
 
 
 @pytest.mark.skipif(not MOVEIT.is_file(), reason="the pose pairs of MoveIt's own test are not here")

@@ -164,6 +164,7 @@ async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
         await rig.go_until_it_moves()
         await rig.pause_after_this_pose("anna")
         finishing = asyncio.ensure_future(rig.session.finish(1))
+        await rig.until(S.SEALING)
     else:
         await rig.go_until(S.SEALING)
     for _ in range(2):

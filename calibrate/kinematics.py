@@ -20,6 +20,9 @@ if TYPE_CHECKING:  # that module needs SciPy
 
 _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 JOINT_NAMES = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
+URDF_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+URDF_ORIGIN = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Keys of the kinematics file of ROS 2's UR driver."""
 
 
 _NONE = (0.0,) * 6

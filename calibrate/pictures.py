@@ -160,7 +160,10 @@ def solve(
         counted = f"the board is seen in {len(views)} of {len(seen)} pictures"
         advice = f"{Counter(without.values()).most_common(1)[0][0]}" if without else "Take 15 to 25."
         raise TooFewViewsError(counted=counted, views=len(views), needed=FEWEST_TO_SOLVE, advice=advice)
-    camera = camera or CameraModel(*next((one.size for one in seen if one.size), (0, 0)))
+    sizes = [one.size for one in seen if one.size]
+    if camera is None and not sizes:
+        raise BadViewsError("shape", what="camera", given="None", wanted="a CameraModel of the images' size")
+    camera = camera or CameraModel(*sizes[0])
     for i, one in enumerate(seen):
         if one.size is not None:
             require_size(camera, one.size, i, f"picture {i}")

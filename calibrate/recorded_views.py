@@ -15,7 +15,7 @@ from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import pose, rotation_from_rpy
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
-from calibrate.kinematics import MODELS, RobotModel, table_of_axes
+from calibrate.kinematics import MODELS, URDF_LINKS, URDF_ORIGIN, RobotModel, table_of_axes
 from calibrate.results import RejectedView
 from calibrate.views import BoardView, ViewSet, require_size
 from recordings import strict_yaml
@@ -140,10 +140,6 @@ def _calibrated_arm(recording: Recording) -> RobotModel | None:
     return replace(published, a_m=a, d_m=d, alpha_rad=alpha, theta_rad=theta)
 
 
-_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-_ORIGIN = ("x", "y", "z", "roll", "pitch", "yaw")
-
-
 def arm_of_ros(content: bytes, robot: str) -> RobotModel:
     """Read the file that `ur_calibration` writes for ROS 2's UR driver: the links' origins, as URDF has them.
 
@@ -154,8 +150,8 @@ def arm_of_ros(content: bytes, robot: str) -> RobotModel:
     chain = [np.eye(4)]
     try:
         links = strict_yaml.load_plain(content)["kinematics"]
-        for link in _LINKS:
-            *origin, roll, pitch, yaw = (float(links[link][name]) for name in _ORIGIN)
+        for link in URDF_LINKS:
+            *origin, roll, pitch, yaw = (float(links[link][name]) for name in URDF_ORIGIN)
             chain.append(chain[-1] @ pose(rotation_from_rpy([roll, pitch, yaw]), origin))
     except (KeyError, TypeError) as problem:
         raise ValueError(f"not as ur_calibration writes it: {problem!r}") from None

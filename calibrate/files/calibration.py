@@ -400,14 +400,14 @@ def decode_calibration(content: bytes, where: str) -> Calibration:
     return calibration
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path | str) -> Calibration:
     """Read and verify a calibration file. Raises CalibrationFileError."""
-    return decode_calibration(read_bounded(path), str(path))
+    return decode_calibration(read_bounded(Path(path)), str(path))
 
 
-def write_calibration(calibration: Calibration, path: Path) -> None:
+def write_calibration(calibration: Calibration, path: Path | str) -> None:
     """Write the file atomically and durably. Raises CalibrationFileError."""
-    write_output(path, encode_calibration(calibration))
+    write_output(Path(path), encode_calibration(calibration))
 
 
 def write_output(path: Path, content: bytes) -> None:

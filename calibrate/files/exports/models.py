@@ -15,7 +15,7 @@ from calibrate.files.calibration import Calibration, CorrectedArm, DhTable
 from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment, how_to_attach
 from calibrate.files.integrity import content_sha256
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
-from calibrate.kinematics import RobotModel, link_frames
+from calibrate.kinematics import URDF_LINKS, URDF_ORIGIN, RobotModel, link_frames
 
 
 def urdf(calibration: Calibration, frames: FrameNames) -> str:
@@ -68,9 +68,6 @@ def _origin(matrix: Array) -> str:
     return f'<origin xyz="{numbers(matrix[:3, 3])}" rpy="{numbers(rpy)}"/>'
 
 
-_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-
-
 def link_origins(table: DhTable) -> Array:
     """Compute the fixed transforms (6, 4, 4) before each joint's rotation about z, as URDF chains them.
 
@@ -105,10 +102,9 @@ def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
         f"{arm.model}: use it only with this camera pose, and this one only with it:\n"
         f"{frames.parent(calibration)} {frames.camera} (x y z, qx qy qz qw) {values}"
     )
-    names = ("x", "y", "z", "roll", "pitch", "yaw")
     plain: dict[str, Any] = {
-        link: dict(zip(names, (*T[:3, 3].tolist(), *roll_pitch_yaw(T[:3, :3])), strict=True))
-        for link, T in zip(_LINKS, link_origins(table), strict=True)
+        link: dict(zip(URDF_ORIGIN, (*T[:3, 3].tolist(), *roll_pitch_yaw(T[:3, :3])), strict=True))
+        for link, T in zip(URDF_LINKS, link_origins(table), strict=True)
     }
     # The driver compares this with the hash of the controller's table and warns, rightly, that they differ.
     plain["hash"] = f"calib_station_{content_sha256(plain)[:16]}"

@@ -92,6 +92,12 @@ def test_any_edit_decodes_to_the_right_size_or_is_refused(name: str, draw: st.Da
         assert decode_image(bytes(data), WIDTH, HEIGHT).shape[:2] == (HEIGHT, WIDTH)
 
 
+@given(st.binary(max_size=100), st.sampled_from([b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"BM", b"P5 "]))
+def test_any_bytes_have_a_header_or_none(data: bytes, start: bytes) -> None:
+    with suppress(ImageError):
+        assert read_header(start + data).width > 0
+
+
 def test_bytes_after_the_last_row_of_an_image_of_a_bag_are_left_out() -> None:
     rows = bytes(range(64)) * 48
     found = raw_array(rows + b"left", "mono8", 60, 48, 64)

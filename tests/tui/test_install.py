@@ -107,6 +107,7 @@ async def test_who_overrules_gives_a_reason(link: FakeLink, calibration: Path) -
         pilot.app.screen.query_one(Input).value = "measured with the tape"
         await pilot.press("enter")
         await until(pilot, lambda: "Installed" in said(pilot))
+        await until(pilot, lambda: "“measured with the tape”" in text_of(pilot.app, "#verdict"))
     override = installed_calibration(calibration.parents[2]).override
     assert override is not None and override.reason == "measured with the tape"
 

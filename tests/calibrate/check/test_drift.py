@@ -175,6 +175,7 @@ def test_the_file_gives_back_what_the_fit_left_known(solved_real: SolvedRecordin
     before, after = known_cell(solved_real.calibration), known_cell(read_calibration(path))
     np.testing.assert_array_equal(after.covariance, before.covariance)
     np.testing.assert_array_equal(after.mean.X, before.mean.X)
+    assert after.flange_extent is not None
     np.testing.assert_array_equal(after.flange_extent, before.flange_extent)
     views = solved_real.views
     assert (

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibrate import load_installed
+from calibrate import load_installed, watch
 from calibrate.errors import CalibrationFileError, InstallError, UsageError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.folders import cameras
@@ -24,6 +24,7 @@ from calibrate.files.touch import Touch
 from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState, validity_text
 from calibrate.files.versions import installed_versions, note_installed
 from tests.codes import raises
+from tests.patience import PATIENCE_S
 
 MakeFile = Callable[..., Path]
 V, U, D, W = ValidityState.VALID, ValidityState.UNVERIFIED, ValidityState.IN_DOUBT, ValidityState.WITHDRAWN
@@ -269,3 +270,13 @@ def test_a_damaged_file_is_never_loaded(root: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"translation_m: [", b"translation_m: [1", 1))
     with raises("damaged-calibration", CalibrationFileError):
         load_installed(root)
+
+
+def test_a_program_that_watches_hears_of_changes_only_and_for_as_long_as_it_said(root: Path) -> None:
+    """`first`: also of what is there. Every kind of change: test_follow."""
+    assert not list(watch(root, poll_s=0.001, stop_s=0.02))
+    changes = watch(root, poll_s=0.01, stop_s=PATIENCE_S, first=True)
+    assert next(changes).installed is not None
+    (root / "calibrations/current").unlink()
+    gone = next(changes)
+    assert gone.installed is None and gone.problem is not None and gone.problem.code == "nothing-installed"

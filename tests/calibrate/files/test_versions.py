@@ -130,7 +130,10 @@ def test_rollback_goes_to_what_was_in_use(make_file, tmp_path: Path, monkeypatch
             install(make_file(0.003), root)
     assert len(installed_versions(root)) == 4
     install(make_file(0.004), root)
-    assert [entry.generation for entry in read_log(root)] == [1, 2, 1, 3, 1, 5]
+    log = read_log(root)
+    assert [entry.generation for entry in log] == [1, 2, 1, 3, 1, 5]
+    assert [entry.action for entry in log[:3]] == ["install", "install", "rollback"]
+    assert log[1].change.startswith("1.000 mm, 0.0000°")
     assert rollback(root).number == 1
     rollback(root, to=3)
     assert rollback(root).number == 1

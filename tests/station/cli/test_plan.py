@@ -39,7 +39,7 @@ def test_json_is_one_object_and_nothing_else(made):
     assert result.returncode == 0
     assert summary["poses"] == 12
     assert summary["problems"] == []
-    assert summary["top_speed_m_s"] <= 0.25
+    assert summary["top_speed_m_s"] <= 0.25 and summary["duration_s"] > 0
 
 
 def test_an_edited_plan_that_hits_something_fails_the_check_with_1(made, tmp_path):

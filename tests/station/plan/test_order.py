@@ -36,6 +36,10 @@ def test_a_blocked_move_is_gone_around():
     assert np.isfinite(path_time(order, times, np.zeros(6)))
 
 
+def test_a_single_pose_is_its_own_order():
+    assert short_order(np.zeros((1, 1)), np.zeros(1), 0) == [0]
+
+
 def test_free_and_blocked_agree_with_the_dense_check():
     rng = np.random.default_rng(5)
     at = forward(MODELS["UR10"], REST)[:3, 3]

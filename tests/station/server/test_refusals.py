@@ -37,6 +37,7 @@ def arguments(verb: str, plan: Plan) -> msgspec.Raw:
 
 def test_every_verb_that_depends_on_a_state_is_tried_here() -> None:
     assert set(ARGUMENTS) == {name for name, verb in VERBS.items() if verb.states != frozenset(S)}
+    assert {name for name in ARGUMENTS if not VERBS[name].control} == FOR_ANYBODY
 
 
 @pytest.mark.parametrize("verb", ARGUMENTS)

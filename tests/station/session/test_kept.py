@@ -60,12 +60,15 @@ async def test_a_drift_check_is_still_one_after_a_crash(new_rig: NewRig) -> None
     assert not second.session.store.status.session.check
 
 
-async def test_a_picture_counts_until_its_pose_was_taken_again_by_an_arm_that_stands_there(rig: Rig) -> None:
+@pytest.mark.parametrize("again", [False, True])
+async def test_a_picture_counts_until_its_pose_was_taken_again_by_an_arm_that_stands_there(
+    rig: Rig, again: bool
+) -> None:
     await rig.go_until_it_moves()
     await rig.pause_after_this_pose("anna")
     await rig.session.edit(1, Retake(0))
     assert rig.session.store.status.session.captured == 1
     rig.arm.slow = False
-    await rig.go_until(S.IDLE, purpose=Purpose.RESUME)
-    assert rig.arm.log.count("move") == POSES
-    assert sealed(rig).views()[0].attempt == 2
+    await (rig.go_until(S.IDLE, purpose=Purpose.RESUME) if again else rig.session.finish(1))
+    assert rig.arm.log.count("move") == (POSES if again else 1)
+    assert [view.attempt for view in sealed(rig).views()] == ([2] + [1] * (POSES - 1) if again else [1])

@@ -41,6 +41,16 @@ async def test_a_move_needs_its_own_approval_and_records_nothing(rig: Rig) -> No
     assert rig.session.context.recording is None and rig.cause == "stop-tested"
 
 
+async def test_stop_of_a_person_stays_latched(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.session.go(1, (await offered(rig)).token)
+    await rig.until(S.MOVING)
+    await rig.session.stop("ben")
+    assert rig.state is S.STOPPED and rig.arm.log.count("stop") == 1
+    with raises("wrong-state", RefusedError):
+        await offered(rig)
+
+
 async def said(rig: Rig) -> bool:
     """Whether doctor, status and the preview of an approval say that it is not accepted: all, or none."""
     context = rig.session.context

@@ -24,6 +24,7 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
     await rig.until(S.PAUSED)
     await until(lambda: rig.session.store.status.pending == "")
     assert rig.pose_states == ["done", *["planned"] * (POSES - 1)] and rig.cause == "paused"
+    assert "anna" in rig.session.store.status.reason
     await asyncio.sleep(0.05)
     assert rig.arm.log.count("move") == 1, "going on needs a new go"
     await rig.go_until(S.MOVING, purpose=Purpose.RESUME)

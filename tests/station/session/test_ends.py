@@ -57,6 +57,13 @@ async def test_what_ends_freedrive_waits_for_its_image_unless_it_is_stop(
         await ending
     assert guided.state is state and guided.pose_states == poses
     assert bool(guided.session.store.status.session.recording) == (by == "finish")
+    assert not guided.arm.guided, "its news may be late as those of an arm at rest"
+    if by != "finish":
+        if by == "stop":
+            await guided.session.acknowledge("anna")
+        await guided.session.switch_free_drive(1, True)
+        await guided.session.record(1)
+        assert guided.state is S.FREE_DRIVE and guided.arm.guided, "what was asked before is done"
 
 
 async def test_control_has_ended_before_the_recording_is_sealed(

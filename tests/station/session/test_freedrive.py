@@ -76,3 +76,14 @@ async def test_while_free_drive_begins_no_go_is_given_and_stop_leaves_a_way_on(
     if not fails:
         await rig.session.finish(1)  # in idle it was refused, and so was every plan
         assert rig.state is S.IDLE
+
+
+async def test_stop_before_free_drive_has_begun_stays_latched(bare_rig: Rig) -> None:
+    bare_rig.arm.late = True
+    beginning = asyncio.ensure_future(bare_rig.session.switch_free_drive(1, True))
+    await asyncio.sleep(0.02)
+    await bare_rig.session.stop("bert")
+    bare_rig.arm.late = False
+    with raises("wrong-state"):
+        await beginning
+    assert bare_rig.state is S.STOPPED

@@ -6,11 +6,14 @@ import asyncio
 from typing import Any
 from unittest.mock import Mock
 
+import msgspec
 import pytest
 
 from recordings.info import recording_info
+from station.analysis.hand_guide import HandGuide
 from station.analysis.pool import WorkerError
 from station.cell.config import vector6
+from station.cell.status import GuidanceStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Skip
 from station.session import capture
@@ -78,15 +81,46 @@ async def test_views_are_taken_by_themselves_and_taken_back(guided: Rig) -> None
     assert not [asked for asked in rig.arm.log if asked not in ("close",)], "the station moved nothing"
 
 
-async def test_views_before_a_crash_count_in_the_guidance(guided: Rig, new_rig: NewRig) -> None:
+async def test_it_is_enough_when_views_and_precision_are(
+    guided: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = guided.session.store
+    await until(lambda: store.status.estimate.views == 1 and guided.state is S.FREE_DRIVE)
+    for least, precise in ((1, True), (2, True), (1, True), (1, False)):
+        monkeypatch.setattr("station.cell.status.FEWEST_BY_HAND", least)
+        store.update(estimate=msgspec.structs.replace(store.status.estimate, enough=precise))
+        enough = least == 1 and precise
+        await until(lambda enough=enough: store.status.guidance.enough is enough)
+
+
+async def test_a_defect_in_the_guidance_costs_one_look(guided: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    look, defects = HandGuide.look, [ZeroDivisionError("a defect")]
+
+    async def broken(*given: Any) -> GuidanceStatus:
+        if defects:
+            raise defects.pop()
+        return await look(*given)
+
+    monkeypatch.setattr(HandGuide, "look", broken)
+    await until(lambda: captured(guided) == 1)
+    assert not defects
+
+
+@pytest.mark.parametrize("counts", [True, False])
+async def test_views_before_a_crash_count_in_the_guidance_unless_taken_back(
+    guided: Rig, new_rig: NewRig, counts: bool
+) -> None:
     await until(lambda: captured(guided) == 1 and guided.state is S.FREE_DRIVE)
+    if not counts:
+        await guided.session.edit(1, Skip(0))
     crash(guided)
     again = await new_rig(with_plan=False, guides=True)
     again.session.context.workers = WorkerThatLooksBack(guided)
     again.session.take_lease(1, "anna")
     await again.session.acknowledge("anna")
     await again.session.switch_free_drive(1, True)
-    assert list(again.session.context.seen) == [0]
+    assert list(again.session.context.seen) == [0] * counts
+    assert captured(again) == counts
 
 
 async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:
@@ -96,7 +130,9 @@ async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:
     lead(rig, guided_joints(TRUTH)[1])
     await until(lambda: S.SETTLING in rig.states[-1:] or rig.camera.glimpses > 20)
     await until(lambda: rig.state is S.FREE_DRIVE)
-    assert captured(rig) == 1 and rig.pose_states == ["done"]
+    assert captured(rig) == 1 and rig.pose_states == ["done"] and not rig.told("not-settled")
+    await rig.session.record(1)
+    assert rig.pose_states == ["done", "failed"] and rig.told("not-settled"), "who asked is told"
     rig.camera.jumps = 0
 
 
@@ -138,6 +174,7 @@ async def test_freedrive_that_ends_while_news_are_late_is_no_fault(guided: Rig) 
     await asyncio.wait({asked})
     assert asked.exception() is not None
     assert rig.state is S.PAUSED and captured(rig) == 1
+    await until(lambda: rig.session.store.status.guidance == GuidanceStatus())
 
 
 async def test_stop_in_a_view_that_is_taken_by_itself_is_latched(

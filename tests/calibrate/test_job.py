@@ -98,7 +98,7 @@ def test_a_number_held_fixed_leaves_the_others_their_stated_error(real_session_f
 
 
 def test_a_lens_of_another_camera_never_passes(real_session_file: Path) -> None:
-    other = CameraModel(480, 384, ((6200.0, 0, 243), (0, 6200, 189), (0, 0, 1)), (-0.9, 2.0, 0.0, 0.0, 0.0))
+    other = CameraModel(480, 384, ((1240.0, 0, 243), (0, 1240, 189), (0, 0, 1)), (-0.9, 2.0, 0.0, 0.0, 0.0))
     with contextlib.suppress(BadViewsError):
         assert not solve_recording(real_session_file, JobOptions(camera=other)).passed
     small = CameraModel(640, 480, CAMERA.matrix, CAMERA.distortion)

@@ -164,7 +164,7 @@ class LimitsConfig(Section, frozen=True):
     """Corner of the box in `base` in which flange and camera must stay; None: no box."""
     planes: tuple[Plane, ...] = ()
     solids: tuple[Capsule, ...] = ()
-    """Solids on the flange, in `flange`."""
+    """Solids on the flange, in `flange`, the camera among them; none: a usual camera is assumed."""
     clearance_m: Length = 0.03
     board_clearance_m: Length = 0.10
 

@@ -79,11 +79,8 @@ class _ProgramsLoader(yaml.CSafeLoader):  # type: ignore[misc]
     """YAML 1.1 with the numbers of JSON and yaml-cpp, `1e-05`."""
 
 
-_ProgramsLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"),
-    list("-+0123456789"),
-)
+_EXPONENT = re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$")
+_ProgramsLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+0123456789"))
 
 
 def _refuse_traps(content: bytes, limit: int) -> None:

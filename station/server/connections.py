@@ -85,14 +85,12 @@ class ClientServer:
         self._status = status
         if changes:
             line = msgspec.json.encode(Answer(changes=changes)) + b"\n"
+            in_control = status.lease.client_id if status.state in RUNNING else None
             for connection in list(self._connections):
                 if connection.watching:
-                    unread_s, controls = (
-                        connection.unread_s(),
-                        connection.peer.client_id == status.lease.client_id,
-                    )
+                    unread_s = connection.unread_s()
                     connection.send(line)
-                    if controls and status.state in RUNNING and unread_s > UNREAD_LIMIT_S:
+                    if connection.peer.client_id == in_control and unread_s > UNREAD_LIMIT_S:
                         connection.abort()
 
     async def close(self) -> None:

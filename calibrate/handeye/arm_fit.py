@@ -17,8 +17,8 @@ from scipy import special
 from calibrate.geometry import Array
 from calibrate.handeye.arm import FLEX
 from calibrate.handeye.cell_state import CellState
-from calibrate.handeye.estimate import Estimate, MeanParts, corner_weights, is_settled
-from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
+from calibrate.handeye.estimate import Estimate, MeanParts, estimate
+from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import Priors
 from calibrate.handeye.uncertainty import inverse_of
@@ -26,12 +26,10 @@ from calibrate.views import Observations
 
 SIZES = 0.0075 * 2.0 ** np.arange(10)
 """1σ of the shifts (mm) and turns (mrad) of the arm's links, from what no view can tell from none."""
-BENDS = np.array([0.0, 0.1, 0.4, 1.6])
-"""1σ of a bracket's compliance, mrad."""
+BENDS = np.array([SIZES[0], 0.1, 0.4, 1.6])
+"""1σ of a bracket's compliance, mrad, from what no view can tell from none."""
 RIGID = 0.5
 """Probability that a bracket does not bend; the other `BENDS` share the rest equally."""
-_NONE = 1e-6
-"""1σ, mm and mrad, that stands for none: a prior cannot be infinitely narrow."""
 _ROUNDS = 3
 """Rounds of `Linear.solve` for each combination: few, as it starts with the noise found for a neighbour."""
 _LEAST = float(np.log(1e-2))
@@ -39,6 +37,7 @@ _LEAST = float(np.log(1e-2))
 
 Sizes = tuple[int, int, int]
 """Places in `SIZES` of the links' shifts and turns, and in `BENDS`."""
+_NONE: Sizes = (0, 0, 0)
 
 
 class _Sizes:
@@ -51,16 +50,24 @@ class _Sizes:
         size = len(SIZES) if by_arm else 1
         self.shape = (size, size, len(BENDS))
 
+    @property
+    def alike(self) -> list[Sizes]:
+        """Combinations of shifts as large, in mm, as turns in mrad, and a rigid bracket."""
+        return [(size, size, 0) for size in range(self.shape[0])]
+
     def sigma(self, one: Sizes) -> Array:
         """1σ (q,) of each error, mm and mrad."""
         shift, turn, bend = one
-        sizes = np.array([SIZES[shift], SIZES[turn], BENDS[bend]])
-        return np.asarray(np.maximum(sizes[self.kinds], _NONE))
+        return np.asarray(np.array([SIZES[shift], SIZES[turn], BENDS[bend]])[self.kinds])
 
     def log_chance(self, one: Sizes) -> float:
         """Log probability of a combination."""
-        bend = RIGID if BENDS[one[2]] == 0 else (1 - RIGID) / (len(BENDS) - 1)
+        bend = RIGID if one[2] == 0 else (1 - RIGID) / (len(BENDS) - 1)
         return float(np.log(bend / (self.shape[0] * self.shape[1])))
+
+    def log_joint(self, found: dict[Sizes, LinearSolution]) -> Array:
+        """Log probability (s,) of each combination and of what was measured."""
+        return np.array([self.log_chance(one) + solution.log_evidence for one, solution in found.items()])
 
     def beside(self, one: Sizes) -> list[Sizes]:
         """Return the combinations in which one size is the next smaller or larger."""
@@ -80,70 +87,59 @@ def estimate_with_arm_errors(
     """
     state = replace(plain.state, arm_errors=np.zeros(observed.by_arm_errors.shape[2]))
     sizes = _Sizes(len(state.arm_errors) - len(FLEX))
-    weights, log_bayes, kept = plain.corner_weights, 0.0, dict[Sizes, LinearSolution]()
-    converged, steps = False, 0
-    while steps < MAX_STEPS and not converged:
-        linear = Linear.at(observed, state, weights)
-        solve = partial(_solve, linear, priors, state)
-        if steps == 0:
-            kept = _explore(sizes, solve, plain.scales)
-        else:
-            kept = {one: solve(sizes.sigma(one), before.scales) for one, before in kept.items()}
-        solutions = list(kept.values())
-        log_joint = np.array([sizes.log_chance(one) + found.log_evidence for one, found in kept.items()])
-        log_all = float(special.logsumexp(log_joint))
-        chances = np.exp(log_joint - log_all)
-        if steps == 0:
-            log_bayes = log_all - solve(_NONE, plain.scales).log_evidence
-        # Mean and covariance of the mixture; the latter with the distances of its parts from the mean.
-        step = chances @ np.array([s.step for s in solutions])
-        by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
-        covariances = np.array([linear.covariance(solution) for solution in solutions])
-        off = np.array([solution.step for solution in solutions]) - step
-        spread = covariances + off[:, :, None] * off[:, None, :]
-        covariance = np.einsum("s,sij->ij", chances, spread)
-        before, state = state, state.moved(step, by_view)
-        best = solutions[int(chances.argmax())]
-        weights = corner_weights(observed, state, best.scales.sigma_px)
-        converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
+    # The rounds of linearisation are those of the likeliest alike sizes; all are averaged where these end.
+    solve = partial(_solve, Linear.at(observed, state, plain.corner_weights), priors, state)
+    alike = {one: solve(sizes.sigma(one), plain.scales) for one in sizes.alike}
+    likeliest = max(alike, key=lambda one: alike[one].log_evidence)
+    scales = replace(alike[likeliest].scales, arm_error_sigma=sizes.sigma(likeliest))
+    settled = estimate(observed, state, priors, scales, fit="robot")
+    linear = Linear.at(observed, settled.state, settled.corner_weights)
+    solve = partial(_solve, linear, priors, settled.state)
+    kept = _explore(sizes, solve, settled.scales)
+    solutions, log_joint = list(kept.values()), sizes.log_joint(kept)
+    log_all = float(special.logsumexp(log_joint))
+    log_bayes = log_all - solve(sizes.sigma(_NONE), plain.scales).log_evidence
+    chances = np.exp(log_joint - log_all)
+    # Mean and covariance of the mixture; the latter with the distances of its parts from the mean.
+    step = chances @ np.array([s.step for s in solutions])
+    by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
+    covariances = np.array([linear.covariance(solution) for solution in solutions])
+    off = np.array([solution.step for solution in solutions]) - step
+    spread = covariances + off[:, :, None] * off[:, None, :]
+    covariance = np.einsum("s,sij->ij", chances, spread)
+    best = solutions[int(chances.argmax())]
     classes = np.einsum("s,snk->nk", chances, [s.chances for s in solutions])
-    of_X = covariance[:6, :6]
     with_errors = replace(
-        plain,
-        state=state,
+        settled,
+        state=settled.state.moved(step, by_view),
         scales=replace(best.scales, arm_error_sigma=chances @ np.array([sizes.sigma(one) for one in kept])),
         chances=classes,
         weight=linear.weights(classes, best.scales),
         covariance=covariance,
         robot=linear.m + linear.J @ step,
         robot_covariance=linear.predicted(best.scales, covariance),
-        board_poses=linear.seen_boards(before.C),
-        corner_weights=weights,
         noise_parts=chances
         @ [linear.noise_parts(s, own) for s, own in zip(solutions, covariances, strict=True)],
         log_evidence=log_all,
-        steps=steps,
-        converged=converged,
         # Variances of X in each part over that of the mixture, averaged over directions.
-        mean_of=MeanParts(chances, np.einsum("ij,sji->s", inverse_of(of_X) / 6, spread[:, :6, :6])),
+        mean_of=MeanParts(
+            chances, np.einsum("ij,sji->s", inverse_of(covariance[:6, :6]) / 6, spread[:, :6, :6])
+        ),
     )
     return with_errors, log_bayes
 
 
-def _solve(
-    linear: Linear, priors: Priors, state: CellState, sigma: Array | float, start: Scales
-) -> LinearSolution:
+def _solve(linear: Linear, priors: Priors, state: CellState, sigma: Array, start: Scales) -> LinearSolution:
     return linear.solve(priors.linearise(state, sigma), start, "robot", _ROUNDS)
 
 
 def _explore(
     sizes: _Sizes, solve: Callable[[Array, Scales], LinearSolution], scales: Scales
 ) -> dict[Sizes, LinearSolution]:
-    """Solve the combinations of `alike`, then the neighbours of every likely one; return the likely ones."""
+    """Solve the alike combinations, then the neighbours of every likely one; return the likely ones."""
     found: dict[Sizes, LinearSolution] = {}
     chance: dict[Sizes, float] = {}
-    # First a rigid bracket, and shifts as large, in mm, as turns in mrad.
-    ahead = [((size, size, 0), scales) for size in range(sizes.shape[0])]
+    ahead = [(one, scales) for one in sizes.alike]
     while ahead:
         one, start = ahead.pop(0)
         if one in found:

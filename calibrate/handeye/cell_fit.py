@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.errors import PosesDisagreeError
+from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import ArmPostures, arm_postures, flange_extent, flex_motion, smooth_motion
 from calibrate.handeye.arm_fit import estimate_with_arm_errors
@@ -53,7 +53,7 @@ class CellFit:
     plain: Estimate
     """The estimate without systematic errors of arm and bracket."""
     smooth: Estimate | None
-    """The estimate for flanges that err smoothly, whatever the joints say; None as `log_bayes`."""
+    """The estimate for flanges that err smoothly, whatever the joints say; None where not modelled."""
     pairs: Pairs
     """Pairs of the views that count."""
     certified: GlobalResult
@@ -97,22 +97,25 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
     STAGES.info("2 of 4: camera, board and lens together")
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
-    log_bayes, plain, failure, smooth = None, found, "", None
+    plain, log_bayes, smooth, failure = found, None, None, ""
     arm, joints_note = arm_postures(views)
     if len(views) >= FEWEST_FOR_ARM_ERRORS:
         flex = flex_motion(views.base_from_flange)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
-        STAGES.info("3 of 4: errors of the arm")
         smoothly = smooth_motion(observed.flange, flange_extent(observed.flange))
-        linked, smoothed = (
-            replace(observed, by_arm_errors=np.concatenate([by_arm, flex], axis=2))
-            for by_arm in (links, smoothly)
-        )
+        STAGES.info("3 of 4: errors of the arm")
+
+        def with_errors(by_arm: Array) -> tuple[Observations, Estimate, float | None]:
+            seen = replace(observed, by_arm_errors=np.concatenate([by_arm, flex], axis=2))
+            return seen, *estimate_with_arm_errors(seen, plain, priors)
+
         try:
-            allowed, evidence = estimate_with_arm_errors(linked, plain, priors)
-            as_told, _ = estimate_with_arm_errors(smoothed, plain, priors)
-            found, log_bayes, observed, smooth = allowed, evidence, linked, as_told
-        except np.linalg.LinAlgError as problem:
+            _, smooth, _ = with_errors(smoothly)
+        except (BadViewsError, np.linalg.LinAlgError) as problem:
+            failure = str(problem)
+        try:
+            observed, found, log_bayes = with_errors(links)
+        except (BadViewsError, np.linalg.LinAlgError) as problem:
             failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used))
     require_motion(pairs)  # a wrong view may have been the only one about a second axis

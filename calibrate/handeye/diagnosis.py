@@ -130,7 +130,6 @@ def _chance(residual: Array, covariance: Array) -> float:
 
 
 FOLDS = 5
-FEWEST_FOR_FOLDS = 6
 _CALLED_TOO_SMALL = 1e-4
 """Probability that a correct predicted error is reported as too small."""
 
@@ -138,7 +137,7 @@ _CALLED_TOO_SMALL = 1e-4
 def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
     """Predict each view from the other folds; None with too few views, or where a fold determines nothing."""
     full = np.flatnonzero(fit.estimate.chances[:, 0] > FULL)
-    if len(full) < FEWEST_FOR_FOLDS:
+    if len(full) <= FOLDS:
         return None
     order = np.random.default_rng(seed).permutation(full)
     missed = np.zeros((len(fit.views), 6))

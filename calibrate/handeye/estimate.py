@@ -106,8 +106,8 @@ def estimate(
     the robot's times `wide`.
     Raises BadViewsError where views and priors together do not determine the unknowns.
     """
-    state, weights = start, observed.present
-    converged, steps = False, 0
+    state, converged, steps = start, False, 0
+    weights = observed.present if scales is None else corner_weights(observed, state, scales.sigma_px)
     linear = Linear.at(observed, state, weights)
     scales = scales or linear.first_scales(wide)
     try:

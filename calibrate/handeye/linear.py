@@ -125,8 +125,7 @@ class Linear:
             residual = self.m + self.J @ step
             z = np.einsum("nkij,nj->nki", S_inverse, residual)
             if fit != "nothing":
-                absorbed = self.J @ covariance @ np.swapaxes(self.J, 1, 2)
-                P = S_inverse - S_inverse @ absorbed[:, None] @ S_inverse
+                P = S_inverse - S_inverse @ self._seen(covariance)[:, None] @ S_inverse
                 before, scales = scales, update_robot(scales, chances, z, P)
                 if fit == "all" and modes is not None:
                     sigma2, lambda2 = modes.variances(before.lambda_px, covariance, step)
@@ -177,7 +176,12 @@ class Linear:
     def predicted(self, scales: Scales, covariance: Array) -> Array:
         """Predict the covariance (n, 6, 6) of m for ordinary views outside the fit of `covariance` (G, G)."""
         noise = scales.tau_px**2 * self.V + np.diag(scales.classes[0])
-        return np.asarray(noise + self.J @ covariance @ np.swapaxes(self.J, 1, 2))
+        return np.asarray(noise + self._seen(covariance))
+
+    def _seen(self, covariance: Array) -> Array:
+        """Compute the covariance (n, 6, 6) of m by that of the shared unknowns (G, G)."""
+        rows = self.J.reshape(-1, len(covariance))  # one product is twice as fast as one for each view
+        return np.asarray((rows @ covariance).reshape(self.J.shape) @ np.swapaxes(self.J, 1, 2))
 
     def noise_parts(self, solved: LinearSolution, covariance: Array) -> Array:
         """Compute X's whitened variance (3,) from corners, robot translation and robot rotation."""

@@ -36,7 +36,8 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     if not fit.observed.has_pixels:
         return None
     chain = fit.arm.chain if fit.arm is not None and fit.arm.recorded else None
-    found = fit.estimate if fit.smooth is None or chain is not None else fit.smooth
+    smooth = fit.smooth if chain is None else None
+    found = fit.estimate if smooth is None else smooth
     state, scales, kept = found.state, found.scales, Layout.of(found.state).all_but_board
     flanges = fit.views.base_from_flange
     level, extent = gravity_in_flange(flanges).mean(axis=0), flange_extent(flanges)
@@ -54,8 +55,10 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
         arm=None if chain is None else chain.plain,
         stated_arm_error=_rows(stated_arm_error) if stated_arm_error.any() else None,
         level=tuple(level.tolist()) if len(state.arm_errors) else None,
-        flange_extent_m=tuple(extent.tolist()) if found is fit.smooth else None,
-        without_joints=None if chain is None else posterior_of(replace(fit, arm=None), stated_arm_error),
+        flange_extent_m=None if smooth is None else tuple(extent.tolist()),
+        without_joints=None
+        if chain is None or fit.smooth is None
+        else posterior_of(replace(fit, arm=None), stated_arm_error),
     )
 
 

@@ -301,7 +301,7 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
         (
             bool(fit.arm_failure),
             "arm-not-fitted",
-            f"Errors of arm and bracket are left out: their fit failed ({fit.arm_failure}).",
+            f"Errors of arm and bracket are left out, or some of them: a fit failed ({fit.arm_failure}).",
         ),
     )
     return tuple(Remark(code, text) for true, code, text in said if true)

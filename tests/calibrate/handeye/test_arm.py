@@ -9,7 +9,7 @@ from scipy import stats
 
 from benchmarks.imperfect_cells import Imperfection, imperfect_cell
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
-from calibrate.handeye import arm_fit, cell_fit
+from calibrate.handeye import cell_fit, estimate
 from calibrate.handeye.arm import arm_postures, flex_motion, gravity_in_flange
 from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.estimate import Estimate, MeanParts
@@ -124,7 +124,7 @@ def test_noise_and_steps_are_those_of_the_fit_that_is_reported(monkeypatch):
     reported, plain = (fit.noise_parts / fit.noise_parts.sum() for fit in (found.estimate, found.plain))
     assert reported[1:].sum() < 0.8 * plain[1:].sum(), "the table explains what was taken for noise"
     assert found.estimate.converged and found.estimate.steps > 2
-    monkeypatch.setattr(arm_fit, "MAX_STEPS", 2)
+    monkeypatch.setattr(estimate, "MAX_STEPS", 2)
     assert "not-converged" in {remark.code for remark in solve_views(views, QUICK).warnings}
 
 
@@ -136,6 +136,24 @@ def test_an_arm_that_cannot_be_fitted_is_said_and_left_out_whole(monkeypatch):
     views = without_joints(worn_views(0.4))
     found = solve_views(replace(views, robot_model="unknown"), QUICK)
     assert found.arm is None and found.posterior.level is None
+    assert "arm-not-fitted" in {remark.code for remark in found.warnings}
+
+
+@pytest.mark.parametrize("errors", [39, 63], ids=["of the links", "of the flange"])
+def test_a_fit_of_errors_that_fails_does_not_cost_the_other(errors, monkeypatch):
+    fits = cell_fit.estimate_with_arm_errors
+
+    def fails(observed, *rest):
+        if observed.by_arm_errors.shape[2] == errors:
+            raise np.linalg.LinAlgError("singular")
+        return fits(observed, *rest)
+
+    monkeypatch.setattr(cell_fit, "estimate_with_arm_errors", fails)
+    found = solve_views(worn_views(0.4), QUICK)
+    assert (found.arm is None) == (errors == 39)
+    assert (found.posterior.arm is None) == (errors == 39)
+    assert (found.posterior.flange_extent_m is None) == (errors == 63)
+    assert found.posterior.without_joints is None
     assert "arm-not-fitted" in {remark.code for remark in found.warnings}
 
 

@@ -18,7 +18,9 @@ _Metres = Annotated[float, msgspec.Meta(ge=-LARGEST_REACH_M, le=LARGEST_REACH_M)
 Place = tuple[_Metres, _Metres, _Metres]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Length = Annotated[float, msgspec.Meta(gt=0, le=LARGEST_REACH_M)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+_SigmaM = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
+_SigmaRad = Annotated[float, msgspec.Meta(ge=0, le=0.8)]
+"""1σ of an initial pose; a larger one was written in millimetres or degrees, or says nothing."""
 _Angle = Annotated[float, msgspec.Meta(ge=-6.3, le=6.3)]
 """Joint angle: none turns further than once around; a larger one was written in degrees."""
 JointAngles = tuple[_Angle, _Angle, _Angle, _Angle, _Angle, _Angle]
@@ -50,8 +52,8 @@ class PoseGuess(Section, frozen=True):
 
     translation_m: Place
     rotation_xyzw: tuple[float, float, float, float]
-    sigma_m: NotNegative = 0.02
-    sigma_rad: NotNegative = 0.1
+    sigma_m: _SigmaM = 0.02
+    sigma_rad: _SigmaRad = 0.1
 
 
 class KinematicsDeltas(Section, frozen=True):
@@ -177,21 +179,23 @@ class PointerConfig(Section, frozen=True):
 
 
 class StillnessConfig(Section, frozen=True):
-    window_s: Positive = stillness.WINDOW_S
-    joint_speed_rad_s: Positive = stillness.JOINT_SPEED_RAD_S
-    position_m: Positive = stillness.POSITION_M
-    rotation_rad: Positive = stillness.ROTATION_RAD
+    """Limits below which the arm is at rest. Larger ones than these were written in another unit."""
+
+    window_s: Annotated[float, msgspec.Meta(gt=0, le=30)] = stillness.WINDOW_S
+    joint_speed_rad_s: Annotated[float, msgspec.Meta(gt=0, le=0.05)] = stillness.JOINT_SPEED_RAD_S
+    position_m: Annotated[float, msgspec.Meta(gt=0, le=0.01)] = stillness.POSITION_M
+    rotation_rad: Annotated[float, msgspec.Meta(gt=0, le=0.05)] = stillness.ROTATION_RAD
     image_motion_px: Positive = 0.3
-    timeout_s: Positive = 5.0
+    timeout_s: Annotated[float, msgspec.Meta(gt=0, le=600)] = 5.0
 
 
 class CaptureConfig(Section, frozen=True):
     GONE: ClassVar = frozenset({"lossless_png", "retries"})
-    time_bound_s: Positive = 0.02
+    time_bound_s: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.02
     """Largest bound of the image time for which a pose is accepted. At the stillness limit of 2 mrad/s it is
     0.04 mm at one metre."""
     free_space_bytes: Annotated[int, msgspec.Meta(ge=0)] = 2_000_000_000
-    goal_m: Positive = 0.001
+    goal_m: Annotated[float, msgspec.Meta(gt=0, le=0.05)] = 0.001
     """Predicted error (1σ of a point at the board's distance) below which the session is complete enough."""
 
 

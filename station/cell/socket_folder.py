@@ -46,22 +46,27 @@ def _is_own(folder: Path) -> bool:
 
 def stop_socket(control: Path) -> Path:
     """Return the path of the STOP socket, beside the control socket."""
-    return control.with_suffix(".stop")
+    return _beside(control, ".stop")
 
 
 def post_socket(control: Path) -> Path:
     """Return the path of the socket to which an arm's pose is posted, beside the control socket."""
-    return control.with_suffix(".post")
+    return _beside(control, ".post")
 
 
 def post_token(control: Path) -> Path:
     """Return the path of the file with the token of programs that post by TCP (`robot.tcp_port`)."""
-    return control.with_suffix(".post-token")
+    return _beside(control, ".post-token")
 
 
 def motion_page(control: Path) -> Path:
     """Return the path of the file with STOP and motion state (`protocol.stop_client`)."""
-    return control.with_suffix(".motion")
+    return _beside(control, ".motion")
+
+
+def _beside(control: Path, suffix: str) -> Path:
+    """Name a file by the whole name of its control socket: two daemons may share a folder."""
+    return control.with_name(control.name.removesuffix(".sock") + suffix)
 
 
 def make_folder(folder: Path) -> None:
@@ -134,13 +139,15 @@ def _own_group_only(status: os.stat_result) -> bool:
 
 
 def bind(link: socket.socket, path: Path) -> None:
-    """Bind a Unix socket with mode 0660. StationError: it cannot be, and is closed.
+    """Bind a Unix socket with mode 0660, or 0600. StationError: it cannot be, and is closed.
 
-    The umask is that of all threads and tasks, so nothing is awaited while it is another.
+    It is the group's only where the folder keeps all others out. Else nobody chose the group: on some systems
+    the first group of every user is the same. The umask is that of all threads and tasks, so nothing is
+    awaited while it is another.
     """
     from station.cell.errors import StationError
 
-    old = os.umask(0o117)
+    old = os.umask(0o177 if path.parent.stat().st_mode & stat.S_IRWXO else 0o117)
     try:
         link.bind(str(path))
     except OSError as error:

@@ -33,10 +33,9 @@ def user_config() -> Path:
 
 def find_config() -> Path | None:
     """$STATION_CONFIG, the user's, or the system's; None where there is none."""
-    places = [user_config(), Path("/etc/station/station.yaml")]
     if named := os.environ.get("STATION_CONFIG"):
-        places.insert(0, Path(named))
-    return next((place for place in places if place.is_file()), None)
+        return Path(named)  # also where it is missing: another cell than the named one is never served
+    return next((p for p in (user_config(), Path("/etc/station/station.yaml")) if p.is_file()), None)
 
 
 def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
@@ -104,6 +103,8 @@ def answers(socket: Path) -> bool:
     try:
         ask(socket, GetPlan())
     except StationError as problem:
+        if problem.code == "not-allowed":  # somebody else's daemon serves there
+            raise
         return not isinstance(problem, DaemonGoneError)
     return True
 

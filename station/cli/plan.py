@@ -19,7 +19,7 @@ from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError, RefusedError, StationError
-from station.cell.layout import cell_geometry
+from station.cell.layout import cell_geometry, require_kept_clear
 from station.cell.limits import PlanCheck, Problem, check_plan
 from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.socket_folder import default_socket
@@ -39,8 +39,8 @@ def plan_command(
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Where plan.yaml goes")] = None,
     check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one")] = None,
-    poses: Annotated[int, typer.Option(min=3, max=200, help="Poses to plan")] = 25,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same plan")] = 0,
+    poses: Annotated[int, typer.Option(min=4, max=200, help="Poses to plan")] = 25,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same plan")] = 0,
     socket: Socket = None,
     purpose: Annotated[Aim, typer.Option("--for", help="arm: its table, too")] = "camera",
     as_json: AsJson = False,
@@ -54,6 +54,7 @@ def plan_command(
     """
     cell, standing = _simulated() if config is None else _configured(config, socket or default_socket())
     if check is not None:
+        require_kept_clear(cell)  # as before every motion
         plan = load_plan(check)
     else:
         if output is not None:

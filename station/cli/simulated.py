@@ -9,7 +9,7 @@ import typer
 from recordings.schema.messages import Mount
 from station.simulation.truth import NoiseLevel, SceneName
 
-Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
+Seed = Annotated[int, typer.Option(min=0, help="Simulated: seed of poses, intrinsics, noise")]
 Scene = Annotated[SceneName, typer.Option(help="Simulated: board and camera; paper-binned: 640×512 pixels")]
 Noise = Annotated[NoiseLevel, typer.Option(help="Simulated: errors of robot and camera")]
 Mounting = Annotated[Mount, typer.Option("--mount", help="Simulated: camera on flange or beside")]

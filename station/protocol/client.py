@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import getpass
-import os
 import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -43,27 +41,14 @@ class DaemonGoneError(StationError):
     code = "no-daemon"
 
 
-def who_am_i() -> str:
-    """Return user and terminal, as 'anna on tty1', by which others see who has control."""
-    try:
-        terminal = " on " + os.ttyname(0).removeprefix("/dev/")
-    except OSError:
-        terminal = ""
-    try:
-        return getpass.getuser() + terminal
-    except (OSError, KeyError):
-        return f"uid {os.getuid()}{terminal}"
-
-
 class Client:
     """Connection to the daemon: of a command while its block runs, of a screen opened again after a loss.
 
     If it is lost, so is control: the daemon stops the arm and pauses.
     """
 
-    def __init__(self, path: Path, who: str = "") -> None:
-        """`who`: name that others see, by default user and terminal."""
-        self._path, self._who = path, who
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._next_id = 1
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
         self._plain_status: dict[str, object] | None = None
@@ -98,7 +83,7 @@ class Client:
         self._writer, self._plain_status = writer, None
         self._reading = asyncio.create_task(self._read(reader, writer), name="client-read")
         try:
-            hello = await self.call(Hello(self._who or who_am_i()), timeout_s=CONNECT_S)
+            hello = await self.call(Hello(), timeout_s=CONNECT_S)
         except StationError:
             await self.close()
             raise

@@ -154,10 +154,9 @@ class Purpose(StrEnum):
 
 
 class Hello(Verb[Welcome], frozen=True):
-    """Introduce the client."""
+    """Ask for the number of this connection, and for the cell."""
 
     control = False
-    who: str = ""
 
 
 class Watch(Verb[Done], frozen=True):
@@ -213,7 +212,7 @@ class MakePlan(Verb[Done], frozen=True):
     moves = True
     spoken = "a new plan"
     poses: Annotated[int, msgspec.Meta(ge=4, le=200)] = 25
-    seed: int = 0
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
     lens_known: bool = False
     aim: Literal["camera", "arm"] = "camera"
     """What the poses should determine: the camera pose, or the arm's table, too."""

@@ -1,7 +1,7 @@
 """Permission to approve motion, decided from what the kernel tells of a client and from the configuration.
 
 What a client says of itself does not count. A person counts as present when the client is in the foreground
-of a terminal that its user owns; what that proves and what it does not: docs/operator/safety.md.
+of a terminal; what that proves and what it does not: docs/operator/safety.md.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ def _terminal_name(number: int) -> str:
 
 @dataclass
 class Peer:
-    """Client process of a connection: what the kernel tells of it, and what it says."""
+    """Client process of a connection, as the kernel tells of it."""
 
     client_id: int
     """Number of the connection; 0: it sent STOP without one."""
     pid: int
     uid: int
-    told: str = ""
-    """Name that the client gave."""
     user: str = ""
     """Name of the user; empty until it is looked up."""
+    terminal: str = ""
+    """Terminal at which its person was seen when it first asked; empty: none."""
     began_ticks: int | None = None
     """Start of the process that made the connection; None: not known."""
     parent: int = 0
@@ -70,8 +70,9 @@ class Peer:
 
     @property
     def who(self) -> str:
-        """Name of the client in log, status and recording."""
-        return f"{self.told or f'uid {self.uid}'} (pid {self.pid})"
+        """Name of the client in log, status and recording, as 'anna on tty1 (pid 4711)'."""
+        place = f" on {self.terminal}" if self.terminal else ""
+        return f"{self.user or f'uid {self.uid}'}{place} (pid {self.pid})"
 
 
 class ApprovalRule:
@@ -86,7 +87,7 @@ class ApprovalRule:
         """Check that a person may approve from this client; return how, for the log. Else RefusedError."""
         if self._simulated:
             return "a simulated cell"
-        if terminal := self._terminal(asks):
+        if terminal := self.terminal(asks):
             self._require_permitted(asks)
             return f"at {terminal}"
         raise RefusedError(
@@ -97,7 +98,7 @@ class ApprovalRule:
         """Check as `by_person`, or that a configured service names the hash of the offered plan."""
         if plan_sha256 and offered_sha256 and plan_sha256 != offered_sha256:
             raise RefusedError("other-plan")
-        if self._simulated or self._terminal(asks):
+        if self._simulated or self.terminal(asks):
             return self.by_person(asks, "A move")
         if asks.user not in self._config.services:
             raise RefusedError("no-service", user=asks.user)
@@ -105,7 +106,8 @@ class ApprovalRule:
             raise RefusedError("no-plan-named", user=asks.user)
         return "as a service, by the plan's hash"
 
-    def _terminal(self, asks: Peer) -> str:
+    def terminal(self, asks: Peer) -> str:
+        """Name the terminal in whose foreground this client's person sees it; empty: none."""
         seen = self._see(asks.pid)
         if seen is None or seen.user != asks.uid or seen.began_ticks != asks.began_ticks:
             return ""

@@ -16,8 +16,6 @@ from station.session.checklist import checklist
 from station.session.session import Session
 from station.session.threads import NAMES
 
-_WHO_LIMIT = 60
-
 
 class SessionDispatcher:
     """The session as the connections of `server.connections` reach it."""
@@ -82,6 +80,7 @@ class SessionDispatcher:
             seen = self._see(peer.pid)
             if seen is not None:
                 peer.began_ticks, peer.parent = seen.began_ticks, seen.parent
+                peer.terminal = self._rule.terminal(peer)
         return peer
 
     async def _carry_out(self, caller: Peer, verb: Verb[object]) -> object:
@@ -89,7 +88,8 @@ class SessionDispatcher:
         session, context, client = self._session, self._session.context, caller.client_id
         match verb:
             case verbs.Hello():
-                return await self._welcome(caller, verb.who)
+                await self._named(caller)
+                return verbs.Welcome(client, str(context.root), context.cell.config)
             case verbs.Release():
                 await self._to_the_end(session.release(client, verb.silent))
             case verbs.Acknowledge():
@@ -125,13 +125,6 @@ class SessionDispatcher:
             case verbs.Doctor():
                 return await checklist(context, session.devices.troubles)
         return None
-
-    async def _welcome(self, caller: Peer, who: str) -> verbs.Welcome:
-        user = (await self._named(caller)).user  # from the kernel; `who` is the client's own claim
-        said = "".join(c for c in who if c.isprintable())[:_WHO_LIMIT] or user
-        caller.told = said if said.split(" ")[0] == user else f"{user} ({said})"
-        context = self._session.context
-        return verbs.Welcome(caller.client_id, str(context.root), context.cell.config)
 
     async def _approval(self, caller: Peer, plan_sha256: str) -> str:
         """Check that this client may approve what is offered; return who did, and how."""

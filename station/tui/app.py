@@ -23,7 +23,7 @@ from station.cell.errors import StationError
 from station.cell.status import MotionPreview, SessionStatus, StationState
 from station.operate.motion import PREPARE_S, prepared_motion
 from station.protocol import verbs
-from station.protocol.client import Client, who_am_i
+from station.protocol.client import Client
 from station.protocol.states import RUNNING
 from station.protocol.verbs import PreviewImage, Purpose
 from station.tui.capture_screen import CaptureScreen
@@ -297,7 +297,7 @@ def _one_more(before: SessionStatus, now: SessionStatus) -> bool:
 
 def run(socket: Path) -> None:
     """Open the screen on the daemon that serves `socket` and return when it is closed."""
-    client = Client(socket, who_am_i())  # by the person's terminal
+    client = Client(socket)
 
     def show() -> None:
         PreviewPane.sharp = sharp_widget()

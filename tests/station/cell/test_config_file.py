@@ -92,6 +92,11 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
             f"camera_guess: {{{PLACE}, sigma_m: -0.02}}\nlimits:",
             "sigma_m: Expected `float` >= 0.0",
         ),
+        ("limits:", f"board_guess: {{{PLACE}, sigma_rad: 3}}\nlimits:", "sigma_rad: Expected `float` <= 0.8"),
+        ("limits:", f"board_guess: {{{PLACE}, sigma_m: 20}}\nlimits:", "sigma_m: Expected `float` <= 0.5"),
+        ("limits:", "stillness: {position_m: 0.05}\nlimits:", "position_m: Expected `float` <= 0.01"),
+        ("limits:", "stillness: {joint_speed_rad_s: 0.1}\nlimits:", "speed_rad_s: Expected `float` <= 0.05"),
+        ("limits:", "capture: {goal_m: 1}\nlimits:", "goal_m: Expected `float` <= 0.05"),
         ("device: KJ001", "device: KJ001, name: Left", "camera.name"),
         (
             "device: KJ001",

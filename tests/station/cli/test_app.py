@@ -21,11 +21,13 @@ from recordings.errors import CodedError, ErrorReport
 from station.cell.errors import StationError
 from station.cell.pose_plan import plan_sha256
 from station.cell.status import MotionPreview
-from station.cli import main, session
+from station.cli import daemon, main, session
 from station.cli.app import STATION
-from station.cli.daemon import own_daemon, tell_what_goes_on
+from station.cli.daemon import ensure_daemon, own_daemon, tell_what_goes_on
 from station.plan.files import load_plan
+from station.protocol.client import DaemonGoneError
 from station.protocol.states import RUNNING
+from tests.codes import raises
 from tests.command_line import call
 from tests.patience import PATIENCE_S, wait_until
 
@@ -157,7 +159,14 @@ def test_what_a_person_can_cause_has_a_code(args: tuple[str, ...], exit_code: in
 
 
 @pytest.mark.parametrize(
-    "args", [("dance",), ("retake", "0"), ("capture", "--frobnicate"), ("demo", "--scene", "moon")]
+    "args",
+    [
+        ("dance",),
+        ("retake", "0"),
+        ("capture", "--frobnicate"),
+        ("demo", "--scene", "moon"),
+        ("demo", "--seed", "-1"),
+    ],
 )
 def test_wrong_usage_ends_with_2_and_nothing_on_stdout(args: tuple[str, ...]) -> None:
     done = call(main, *args)
@@ -175,12 +184,33 @@ def test_a_folder_that_cannot_be_made_is_named() -> None:
     assert done.returncode == 1 and __file__ in done.stderr and done.stdout == ""
 
 
+def test_a_configuration_that_is_named_is_never_replaced_by_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATION_CONFIG", str(tmp_path / "typo.yaml"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    with raises("not-started") as problem:
+        ensure_daemon(tmp_path / "c.sock")
+    assert "typo.yaml" in str(problem.value)
+
+
+def test_no_second_daemon_is_started_where_one_serves_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(path: Path, verb: object) -> None:
+        raise DaemonGoneError("not-allowed", path=path)
+
+    monkeypatch.setattr(daemon, "ask", refused)
+    with raises("not-allowed"):
+        ensure_daemon(tmp_path / "c.sock")
+
+
 def test_closing_the_screen_tells_what_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "control.sock"
     tell_what_goes_on(path)
     assert capsys.readouterr().out == ""  # none serves there
-    with socket.socket(socket.AF_UNIX) as daemon:
-        daemon.bind(str(path))
-        daemon.listen()
+    with socket.socket(socket.AF_UNIX) as served:
+        served.bind(str(path))
+        served.listen()
         tell_what_goes_on(path)
     assert f"`kill {os.getpid()}`" in capsys.readouterr().out

@@ -61,12 +61,13 @@ def test_a_plan_of_the_other_mount_fails_the_check_with_1(made, tmp_path):
     assert result.returncode == 1
 
 
-def test_checking_needs_no_lens(made, tmp_path):
-    truth = make_cell("paper", 0, "low", "eye-in-hand")
-    config = cell_config(truth, "127.0.0.1")
+def test_checking_needs_no_lens_but_knows_as_the_daemon_does_what_to_keep_clear_of(made, tmp_path):
+    config = cell_config(make_cell("paper", 0, "low", "eye-in-hand"), "127.0.0.1")
     blind = msgspec.structs.replace(config, camera=msgspec.structs.replace(config.camera, model=None))
-    (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(blind))
-    assert run("--config", tmp_path / "cell.yaml", "--check", made[1]).returncode == 0
+    unplaced = msgspec.structs.replace(config, board_guess=None)
+    for cell, code in ((blind, 0), (unplaced, 2)):
+        (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(cell))
+        assert run("--config", tmp_path / "cell.yaml", "--check", made[1]).returncode == code
 
 
 def test_only_plans_are_written_over(tmp_path):

@@ -17,10 +17,13 @@ import pytest
 from station.cell.errors import StationError
 from station.cell.socket_folder import (
     UntrustedFolderError,
+    bind,
     default_socket,
     folder_owner,
     make_folder,
     motion_page,
+    post_socket,
+    post_token,
     stop_socket,
 )
 from station.protocol.client import Client
@@ -354,6 +357,23 @@ def test_the_page_is_read_as_it_was_written_and_nothing_else_is_taken_for_one(tm
     os.close(read)
     with pytest.raises(PermissionError):
         open_page(path, {os.getuid() + 1})
+
+
+def test_in_a_folder_that_others_may_enter_a_socket_is_its_owners_alone(tmp_path: Path) -> None:
+    for folder, mode in ((0o755, 0o600), (0o750, 0o660)):
+        tmp_path.chmod(folder)
+        path = tmp_path / f"{folder:o}.sock"
+        with socket.socket(socket.AF_UNIX) as link:
+            bind(link, path)
+        assert stat.S_IMODE(path.stat().st_mode) == mode
+
+
+def test_two_daemons_of_one_folder_share_no_file(tmp_path: Path) -> None:
+    controls = [tmp_path / name for name in ("station.left", "station.right", "c.sock", "x.stop")]
+    files = [
+        of(control) for control in controls for of in (stop_socket, motion_page, post_socket, post_token)
+    ]
+    assert len({*controls, *files}) == 20
 
 
 async def test_socket_and_page_are_the_groups(station: Station) -> None:

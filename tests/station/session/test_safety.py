@@ -258,7 +258,7 @@ async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> 
     await control.start()
     await rig.session.release(1)
     rig.session.context.queue = None
-    async with Client(tmp_path / "s", "tty1") as anna:
+    async with Client(tmp_path / "s") as anna:
         async with asyncio.timeout(PATIENCE_S):
             with pytest.raises(StationError):
                 await anna.request("go", token="made up")

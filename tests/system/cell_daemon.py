@@ -1,8 +1,7 @@
 """The real daemon in front of a simulated controller that outlives it: python -m tests.system.cell_daemon …
 
 `station serve --simulate` owns its controller, which ends with it; here a test can look at the arm of a
-daemon that was killed. CELL_TOLD: another truth, that the configuration is made from. CELL_CONTROL: what
-drives the arm.
+daemon that was killed. CELL_CONTROL: what drives the arm.
 CELL_HANGS: `camera` or `disk` hangs for ever, from the second image or the first view on.
 """
 
@@ -60,7 +59,7 @@ def main() -> None:
     host, truth_file, root, socket = sys.argv[1:5]
     log_to_stderr()
     truth = read_truth(Path(truth_file))
-    config = cell_config(read_truth(Path(os.environ.get("CELL_TOLD", truth_file))), host)
+    config = cell_config(truth, host)
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1)
     robot = msgspec.structs.replace(config.robot, control=os.environ.get("CELL_CONTROL"))
     config = msgspec.structs.replace(config, capture=capture, robot=robot)

@@ -27,24 +27,20 @@ def test_it_holds_for_the_arm_that_was_tested(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "void"),
     [
-        {"serial": "2025"},
-        {"controller_version": "5.12.0"},
-        {"payload": (1.3, 0.0, 0.0, 0.05)},
-        {"payload": (1.2, 0.0, 0.02, 0.05)},
-        {"payload": ()},
-        {"control_path": "script"},
-        {"source": "simulated"},
+        ({"serial": "2025"}, True),
+        ({"controller_version": "5.12.0"}, True),
+        ({"payload": (1.3, 0.0, 0.0, 0.05)}, True),
+        ({"payload": (1.2, 0.0, 0.02, 0.05)}, True),
+        ({"payload": ()}, True),
+        ({"payload": (1.2001, 0.0, 0.0001, 0.05)}, False),  # as RTDE rounds it
+        ({"control_path": "script"}, True),
+        ({"source": "simulated"}, True),
     ],
 )
-def test_another_arm_firmware_payload_or_path_makes_it_void(change: dict[str, object]) -> None:
-    assert not_accepted(PASSED, msgspec.structs.replace(SUBJECT, **change))
-
-
-def test_rounding_of_the_payload_does_not() -> None:
-    rounded = msgspec.structs.replace(SUBJECT, payload=(1.2001, 0.0, 0.0001, 0.05))
-    assert not_accepted(PASSED, rounded) == ""
+def test_another_arm_firmware_payload_or_path_makes_it_void(change: dict[str, object], void: bool) -> None:
+    assert bool(not_accepted(PASSED, msgspec.structs.replace(SUBJECT, **change))) is void
 
 
 def test_it_holds_up_to_the_speed_that_passed() -> None:

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from calibrate.geometry import pose, rotation_exp
 from calibrate.kinematics import MODELS, forward, link_frames
 from station.cell.collision import (
     ARM_BODIES,
@@ -15,7 +14,6 @@ from station.cell.collision import (
     body_segments,
     margins,
     moving_points,
-    plate,
     segment_distance,
 )
 from station.cell.config import Capsule, LimitsConfig, Plane
@@ -107,16 +105,6 @@ def test_the_last_body_ends_at_the_flange():
     np.testing.assert_allclose(ends[:, 6], forward(MODELS["UR10e"], joints)[:, :3, 3], atol=1e-12)
 
 
-def test_a_plane_is_named_with_the_body_that_breaks_it():
-    table = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    geometry = CellGeometry(MODELS["UR10"], LimitsConfig(planes=(table,)))
-    low = np.deg2rad([0.0, -10.0, 40.0, -120.0, -90.0, 0.0])
-    gaps, contacts = margins(geometry, np.array([UPRIGHT, low]))
-    broken = {contact for contact, gap in zip(contacts, gaps[1], strict=True) if gap < 0}
-    assert gaps[0].min() > 0
-    assert ("forearm", "table", "plane") in broken
-
-
 def test_margins_are_distances_less_radii_and_clearance():
     """By hand: a wrist over a table, a ball in front of the flange, a camera beside the base column."""
     table = Plane("table", (0.0, 0.0, -0.2), (0.0, 0.0, 2.0))
@@ -151,17 +139,6 @@ def test_the_workspace_box_holds_for_flange_and_camera():
     gaps, contacts = margins(CellGeometry(MODELS["UR10"], tight, watched_m=((0.0, 0.0, 0.2),)), UPRIGHT)
     assert gaps.min() == pytest.approx(-0.19, abs=0.01)
     assert contacts[gaps[0].argmin()].kind == "workspace"
-
-
-def test_a_plate_covers_its_whole_area():
-    frame = pose(rotation_exp([0.3, -0.2, 0.9]), [0.5, 0.1, 0.2])
-    rods = plate("board", frame, np.array([-0.05, -0.02]), np.array([0.2, 0.15]))
-    flat = np.random.default_rng(0).uniform([-0.05, -0.02, 0], [0.2, 0.15, 1e-12], (300, 3))
-    placed = flat @ frame[:3, :3].T + frame[:3, 3]
-    reach = [
-        segment_distance(placed, placed, np.array(r.from_m), np.array(r.to_m)) - r.radius_m for r in rods
-    ]
-    assert np.min(reach, axis=0).max() <= 1e-9
 
 
 def test_moving_points_include_what_is_watched():

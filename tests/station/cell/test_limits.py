@@ -16,7 +16,6 @@ from station.cell.limits import (
     check_path,
     check_plan,
     leaving,
-    point_speed_m_s,
     sample_path,
     trapezoid,
 )
@@ -158,10 +157,7 @@ def test_leaving_excuses_only_an_unbroken_retreat_that_ends_outside():
     assert leaving(np.array([[-0.03], [-0.02], [-0.025], [0.02]])).min() < 0
     assert leaving(np.array([[-0.03], [0.02], [-0.01], [0.02]])).min() < 0
     assert leaving(np.array([[-0.03], [-0.02], [-0.01]])).min() < 0
-
-
-def test_sliding_along_a_wall_is_no_retreat():
-    slide = np.array([[-0.03]] * 9 + [[0.02]])
+    slide = np.array([[-0.03]] * 9 + [[0.02]])  # along a wall
     assert leaving(slide).min() < 0
     assert leaving(slide + np.linspace(0, 0.005, 10)[:, None]).min() < 0
 
@@ -203,11 +199,3 @@ def test_trapezoid_times():
     assert (float(duration), float(peak)) == pytest.approx((2.5, 0.5))
     duration, peak = trapezoid(0.01, 0.5, 4.0)
     assert (float(duration), float(peak)) == pytest.approx((0.1, 0.2))
-
-
-def test_point_speed_of_a_turning_base():
-    still = point_speed_m_s(FREE, REST, np.zeros(6))
-    turning = point_speed_m_s(FREE, REST, [0.3, 0, 0, 0, 0, 0])
-    points = moving_points(FREE, REST[None])[0]
-    assert still == 0.0
-    assert turning == pytest.approx(0.3 * np.hypot(points[:, 0], points[:, 1]).max(), rel=1e-6)

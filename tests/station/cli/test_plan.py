@@ -54,13 +54,6 @@ def test_an_edited_plan_that_hits_something_fails_the_check_with_1(made, tmp_pat
     assert {problem["limit"] for problem in summary["problems"]} >= {"clearance"}
 
 
-def test_a_plan_of_the_other_mount_fails_the_check_with_1(made, tmp_path):
-    config = cell_config(make_cell("paper", 0, "low", "eye-to-hand"), "127.0.0.1")
-    (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(config))
-    result = run("--config", tmp_path / "cell.yaml", "--check", made[1])
-    assert result.returncode == 1
-
-
 def test_checking_needs_no_lens_but_knows_as_the_daemon_does_what_to_keep_clear_of(made, tmp_path):
     config = cell_config(make_cell("paper", 0, "low", "eye-in-hand"), "127.0.0.1")
     blind = msgspec.structs.replace(config, camera=msgspec.structs.replace(config.camera, model=None))

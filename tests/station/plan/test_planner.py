@@ -185,6 +185,7 @@ def test_what_planning_needs_is_asked_for():
     for code, changes in (
         ("no-guess", {"board_guess": None}),
         ("no-guess", {"camera_guess": None}),
+        ("guess-too-rough", {"camera_guess": moved(config.camera_guess, sigma_m=0.06)}),
         ("no-lens", {"camera": moved(config.camera, model=None)}),
         ("unknown-robot-model", {"robot": moved(config.robot, model="UR10000")}),
     ):

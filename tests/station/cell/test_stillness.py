@@ -68,7 +68,7 @@ def test_a_shaking_arm_is_measured() -> None:
 
 
 @pytest.mark.parametrize(
-    ("joint", "moves"), [(1, "the flange scatters by"), (5, "the flange turns by 0.0170°")]
+    ("joint", "moves"), [(1, "the flange scatters by"), (5, "the flange turns by 0.017")]
 )
 def test_a_slow_creep_is_no_rest_although_no_speed_is_reported(joint: int, moves: str) -> None:
     """The last joint turns the flange on the spot."""

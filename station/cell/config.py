@@ -239,5 +239,3 @@ class StationConfig(Section, frozen=True):
 
 PAPER_BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=7, rows=6, square_m=0.025)
 """The paper's chessboard: 8×7 squares of 25 mm."""
-BLOG_BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=9, rows=6, square_m=0.030)
-"""The blog's chessboard: 10×7 squares of 30 mm."""

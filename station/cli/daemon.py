@@ -83,20 +83,20 @@ def _started(arguments: Sequence[str], log: Path, stdin: int) -> subprocess.Pope
 
 def tell_what_goes_on(socket: Path) -> None:
     """Tell a person who closed the screen that the daemon goes on, and how to end it."""
-    with connection(AF_UNIX) as link:
-        try:
-            link.connect(str(socket))
-        except OSError:
-            return
-        how = way_to_end(link)
-    print(f"The station goes on without this screen. `station` opens it again.{how and f' End it{how}.'}")
+    if (how := _way_to_end(socket)) is not None:
+        print(f"The station goes on without this screen. `station` opens it again.{how and f' End it{how}.'}")
 
 
 def require_none(path: Path) -> None:
     """Raise StationError (`already-served`) where a daemon serves."""
+    if (how := _way_to_end(path)) is not None:
+        raise StationError("already-served", path=path, how=how)
+
+
+def _way_to_end(socket: Path) -> str | None:
+    """Say how this user ends the daemon that serves; empty: it is another's; None: none serves."""
     with connection(AF_UNIX) as link:
-        if link.connect_ex(str(path)) == 0:
-            raise StationError("already-served", path=path, how=way_to_end(link))
+        return way_to_end(link) if link.connect_ex(str(socket)) == 0 else None
 
 
 def answers(socket: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Simulated cells: those of the paper and the blog, and others by seed.
+"""Simulated cells: that of the paper, and others by seed.
 
 Seed 0 is the cell as published. Other seeds turn and lean the camera and draw the board's pose, the lens and
 noise. The arm starts where the camera looks at the board.
@@ -16,7 +16,6 @@ from calibrate.geometry import Array, inverse, pose, project_to_rotation, rotati
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
 from station.cell.config import (
-    BLOG_BOARD,
     PAPER_BOARD,
     CameraConfig,
     CaptureConfig,
@@ -49,28 +48,7 @@ PAPER_LENS = CameraModel(
     matrix=((_FOCAL_PX + 3.1, 0.0, 646.2), (0.0, _FOCAL_PX + 2.7, 505.8), (0.0, 0.0, 1.0)),
     distortion=(-0.092, 0.118, 0.0004, -0.0003, 0.0),
 )
-_BLOG_FOCAL_PX = float(360.0 / np.tan(np.deg2rad(31.0482) / 2))
-BLOG_LENS = CameraModel(
-    width=960,
-    height=720,
-    matrix=((_BLOG_FOCAL_PX, 0.0, 480.0), (0.0, _BLOG_FOCAL_PX, 360.0), (0.0, 0.0, 1.0)),
-)
-BLOG_X = pose(rotation_exp([0.0, np.deg2rad(-15.0), 0.0]), [0.1, 0.0, 0.0])
-"""The blog's `Hand-Eye` frame, whose z is taken as the optical axis: RPY(0, -15, 0)° at (0.1, 0, 0) m."""
-
-
-class _PublishedCell(NamedTuple):
-    board: BoardSpec
-    lens: CameraModel
-    X: Array
-    """flange_from_camera"""
-
-
-_PUBLISHED = {
-    "paper": _PublishedCell(PAPER_BOARD, PAPER_LENS, PAPER_X),
-    "blog": _PublishedCell(BLOG_BOARD, BLOG_LENS, BLOG_X),
-    "paper-binned": _PublishedCell(PAPER_BOARD, scaled(PAPER_LENS, 0.5), PAPER_X),
-}
+_LENSES = {"paper": PAPER_LENS, "paper-binned": scaled(PAPER_LENS, 0.5)}
 _START_RAD = {
     "eye-in-hand": np.deg2rad([0.0, -94.0, -90.0, -86.0, 90.0, 0.0]),
     "eye-to-hand": np.deg2rad([0.0, -94.0, -90.0, 4.0, 90.0, 0.0]),
@@ -110,16 +88,14 @@ def make_cell(
 ) -> CellTruth:
     """Make the truth of a cell; equal arguments give the same cell."""
     rng = np.random.default_rng([2026, seed])
-    published = _PUBLISHED[scene]
-    camera = published.lens if seed == 0 else _other_lens(published.lens, rng)
-    place = _before_camera if mount == "eye-to-hand" else _before_board
-    X, Y, start = place(published, seed, rng)
+    camera = _LENSES[scene] if seed == 0 else _other_lens(_LENSES[scene], rng)
+    X, Y, start = _before_camera(rng) if mount == "eye-to-hand" else _before_board(seed, rng)
     truth = CellTruth(
         scene=scene,
         seed=seed,
         mount=mount,
         robot_model=ROBOT,
-        board=published.board,
+        board=PAPER_BOARD,
         camera=camera,
         camera_mount=matrix4(X),
         board_place=matrix4(Y),
@@ -145,11 +121,9 @@ def _turned(rng: np.random.Generator, lean_rad: float) -> Array:
     return lean @ rotation_exp([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
 
 
-def _before_board(
-    published: _PublishedCell, seed: int, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
+def _before_board(seed: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Place the board on the table where a camera on the flange looks; return X, Y and start joints."""
-    X, start, height_m = published.X, _START_RAD["eye-in-hand"], 0.0
+    X, start, height_m = PAPER_X, _START_RAD["eye-in-hand"], 0.0
     around = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     if seed != 0:
         X = pose(_turned(rng, 0.0), [0.0, 0.0, 0.0]) @ X @ pose(_turned(rng, _LEAN_RAD), [0.0, 0.0, 0.0])
@@ -158,18 +132,16 @@ def _before_board(
     base_from_camera = forward(MODELS[ROBOT], start) @ X
     axis, eye = base_from_camera[:3, 2], base_from_camera[:3, 3]
     middle = eye + axis * (height_m - eye[2]) / axis[2]
-    return X, pose(around, middle - around @ board_centre(published.board)), start
+    return X, pose(around, middle - around @ board_centre(PAPER_BOARD)), start
 
 
-def _before_camera(
-    published: _PublishedCell, seed: int, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
+def _before_camera(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Place a fixed camera before a board on the flange, which faces away from the arm."""
     start = _START_RAD["eye-to-hand"] + rng.uniform(-_JOG_RAD, _JOG_RAD, 6)
     turn = rotation_exp([np.pi, 0.0, 0.0]) @ _turned(rng, 0.1)
     beside_m = [*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.03, 0.06)]
-    Y = pose(turn, np.array(beside_m) - turn @ board_centre(published.board))
-    view = seen_from(published.board, rng.uniform(0.48, 0.55), _turned(rng, 0.2))
+    Y = pose(turn, np.array(beside_m) - turn @ board_centre(PAPER_BOARD))
+    view = seen_from(PAPER_BOARD, rng.uniform(0.48, 0.55), _turned(rng, 0.2))
     return forward(MODELS[ROBOT], start) @ Y @ inverse(view), Y, start
 
 

@@ -14,17 +14,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
 from station.cell.errors import CameraError, RobotError
 from station.simulation.camera_process import CameraProcess
-from station.simulation.cells import make_cell
 from station.simulation.truth import read_truth
 
 LIBRARY = "libaravis-0.8.so.0"
@@ -167,13 +165,12 @@ def rendered_source(camera: CameraProcess) -> Source:
     return source
 
 
-def main(
-    controller_host: Annotated[str, typer.Option(help="Whose arm the camera looks at.")] = "",
-    truth: Annotated[Path | None, typer.Option(help="File of the simulated cell.")] = None,
-    serial: Annotated[str, typer.Option(help="As the camera reports it.")] = "SIM00000",
-) -> None:
-    """Serve at 127.0.0.1 until standard input ends; print one JSON line when listening."""
-    cell = make_cell() if truth is None else read_truth(truth)
+def main(controller_host: str, truth: str, serial: str) -> None:
+    """Serve at 127.0.0.1 until standard input ends; print one JSON line when listening.
+
+    `controller_host`: whose arm the camera looks at. `truth`: file of the simulated cell.
+    """
+    cell = read_truth(Path(truth))
     rendered = CameraProcess(cell, controller_host, cell.exposure_us, cell.gain_db)
     rendered.warm_up()
     cv2.setNumThreads(1)
@@ -189,4 +186,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main(*sys.argv[1:])

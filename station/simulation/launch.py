@@ -104,13 +104,7 @@ def start_controller(
     raise RobotError("simulation-not-started", device=model, reason=problem, exit_code=child.returncode)
 
 
-def start_gige(
-    controller_host: str = "",
-    *,
-    truth: Path | None = None,
-    serial: str = "SIM00000",
-    log: Path | None = None,
-) -> ChildProcess:
+def start_gige(controller_host: str, truth: Path, serial: str, log: Path | None = None) -> ChildProcess:
     """Start the camera on 127.0.0.1 and wait until it listens; blocking, so call it outside an event loop.
 
     log: where its standard error goes.
@@ -119,8 +113,7 @@ def start_gige(
     """
     if not is_isolated():
         raise CameraError("not-isolated")
-    command = [sys.executable, "-m", "station.simulation.gige", "--serial", serial]
-    command += ["--controller-host", controller_host, *([] if truth is None else ["--truth", str(truth)])]
+    command = [sys.executable, "-m", "station.simulation.gige", controller_host, str(truth), serial]
     process, problem = start_child(command, GIGE_TIMEOUT_S, log)
     if problem:
         raise CameraError("simulation-not-started", device="GigE camera", reason=problem)

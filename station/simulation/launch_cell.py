@@ -83,7 +83,7 @@ def _gige(config: StationConfig, truth: CellTruth, folder: Path, ends: ExitStack
     from station.simulation.launch import start_gige
 
     serial, log = f"SIM{truth.seed:05d}", folder / "camera.log"
-    ends.enter_context(start_gige(config.robot.host, truth=folder / TRUTH, serial=serial, log=log))
+    ends.enter_context(start_gige(config.robot.host, folder / TRUTH, serial, log))
     return AravisCamera(config.camera)
 
 

@@ -17,7 +17,7 @@ from station.cell.errors import ConfigError
 from station.simulation.controller.state import ArmTruth
 
 _LIMIT_BYTES = 1024 * 1024
-SceneName = Literal["paper", "blog", "paper-binned"]
+SceneName = Literal["paper", "paper-binned"]
 NoiseLevel = Literal["low", "mid", "high"]
 
 

@@ -23,22 +23,6 @@ class UnreachableError(Exception):
     """The arm cannot go there: a joint would be beyond its limit."""
 
 
-class JointPath:
-    """To given joints, all together, each in proportion to its own way.
-
-    Its parameter `s` is the leading joint's angle [rad], from 0 to `length`.
-    """
-
-    def __init__(self, start: Vector, goal: Vector) -> None:
-        if any(not abs(q) <= JOINT_LIMIT_RAD for q in goal):
-            raise UnreachableError(f"joints {goal} are outside ±2π")
-        self._start, self._goal = start, goal
-        self.length = max(abs(b - a) for a, b in zip(start, goal, strict=True))
-
-    def at(self, s: float) -> Vector:
-        return between(self._start, self._goal, s / self.length) if s < self.length else self._goal
-
-
 @dataclass(frozen=True)
 class Trapezoid:
     """Constant acceleration, constant speed, constant deceleration (or a triangle, when short).
@@ -93,17 +77,31 @@ Profile = Trapezoid | Braking
 
 
 class JointMotion:
-    """One way to joints. `done` once the arm's command rests at its end."""
+    """One way to joints, all together, each in proportion to its own. `done` once it rests at its end.
+
+    Its parameter `s` is the leading joint's angle [rad], from 0.
+    """
 
     def __init__(self, goal: Vector, speed: float, acceleration: float) -> None:
+        """Raises UnreachableError."""
+        if any(not abs(q) <= JOINT_LIMIT_RAD for q in goal):
+            raise UnreachableError(f"joints {goal} are outside ±2π")
         self.goal = goal
         self.speed = speed
         self.acceleration = acceleration
-        self.path: JointPath | None = None
-        self.profile: Profile | None = None
+        self.begin(goal)
         self.elapsed_s = 0.0
         self.braking = False
         self.done = False
+
+    def begin(self, start: Vector) -> None:
+        """Set out from these joints."""
+        self._start = start
+        self._length = max(abs(b - a) for a, b in zip(start, self.goal, strict=True))
+        self.profile: Profile = Trapezoid(self._length, self.speed, self.acceleration)
+
+    def at(self, s: float) -> Vector:
+        return between(self._start, self.goal, s / self._length) if s < self._length else self.goal
 
 
 class SimulatedArm:
@@ -133,14 +131,12 @@ class SimulatedArm:
         if self.motion is None:
             self._begin(motion)
         else:
-            JointPath(self.command, goal)  # an impossible goal is refused now, not after the braking
             self.brake(PROGRAM_END_RAD_S2)
             self._next = motion
         return motion
 
     def _begin(self, motion: JointMotion) -> None:
-        motion.path = JointPath(self.command, motion.goal)
-        motion.profile = Trapezoid(motion.path.length, motion.speed, motion.acceleration)
+        motion.begin(self.command)
         self.motion = motion
         self._misses = (self.miss, self._draw_miss())
 
@@ -149,7 +145,7 @@ class SimulatedArm:
         duration_s = max(map(abs, self.command_speed)) / deceleration_rad_s2
         self._drop_next()
         motion = self.motion
-        if motion is None or motion.profile is None:
+        if motion is None:
             return
         s, speed = motion.profile.at(motion.elapsed_s)
         speed *= self.scale
@@ -185,11 +181,10 @@ class SimulatedArm:
         self._lag(dt_s)
 
     def _follow(self, motion: JointMotion, dt_s: float) -> None:
-        assert motion.path is not None and motion.profile is not None
         motion.elapsed_s += dt_s * (1.0 if motion.braking else self.scale)
         profile = motion.profile
         s, _ = profile.at(motion.elapsed_s)
-        joints = motion.path.at(s)
+        joints = motion.at(s)
         self.command_speed = tuple((b - a) / dt_s for a, b in zip(self.command, joints, strict=True))
         self.command = joints
         share = min(1.0, motion.elapsed_s / profile.duration_s) if profile.duration_s > 0 else 1.0

@@ -56,23 +56,14 @@ TABLES = {
 }
 
 
-def position(T: Rigid) -> Vector:
-    """(3,) where its origin is."""
-    return (T[3], T[7], T[11])
-
-
-def moved_to(T: Rigid, position: Vector) -> Rigid:
-    """The same rotation at another position (3,)."""
-    x, y, z = position
-    return (*T[:3], x, *T[4:7], y, *T[8:11], z)
-
-
 def between(first: Vector, second: Vector, share: float) -> Vector:
     return tuple(a + share * (b - a) for a, b in zip(first, second, strict=True))
 
 
-def plus(a: Vector, b: Vector, times: float = 1.0) -> Vector:
-    return (a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2])
+def nudged(T: Rigid, by: Vector) -> Rigid:
+    """Turned where it is by φ and moved by δt. by: (6,) δt [m], φ [rad], seen from where T maps to."""
+    R = compose(from_rotvec(*by[3:]), T)
+    return (*R[:3], T[3] + by[0], *R[4:7], T[7] + by[1], *R[8:11], T[11] + by[2])
 
 
 def compose(A: Rigid, B: Rigid) -> Rigid:

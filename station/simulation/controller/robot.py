@@ -10,16 +10,7 @@ import logging
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
 from station.simulation.controller.arm import PROGRAM_END_RAD_S2, JointMotion, UnreachableError
 from station.simulation.controller.interpreted import InterpretedProgram
-from station.simulation.controller.kinematics import (
-    Rigid,
-    Vector,
-    compose,
-    forward,
-    from_rotvec,
-    moved_to,
-    plus,
-    position,
-)
+from station.simulation.controller.kinematics import Rigid, Vector, forward, nudged
 from station.simulation.controller.state import ControllerState, Journal, Settings
 from station.simulation.controller.uploads import Upload
 from station.simulation.controller.urscript_parser import ScriptError, ScriptSyntaxError
@@ -196,5 +187,4 @@ class SimulatedRobot(ControllerState):
 
     def true_flange(self, joints: Vector, miss: Vector) -> Rigid:
         """base_from_flange with the arm's real lengths and its repeatability error."""
-        T = forward(self.true_table, joints)
-        return moved_to(compose(from_rotvec(*miss[3:]), T), plus(position(T), miss))
+        return nudged(forward(self.true_table, joints), miss)

@@ -12,7 +12,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -103,15 +103,13 @@ class Journal:
     """The newest entries in full; counts per (source, verb) of all of them, never forgotten."""
 
     def __init__(self) -> None:
-        self._entries: deque[tuple[int, dict[str, object]]] = deque(maxlen=ENTRIES)
+        self._entries: deque[dict[str, Any]] = deque(maxlen=ENTRIES)
         self._counts: Counter[str] = Counter()
 
     def note(self, source: str, verb: str, **details: object) -> None:
         """source: dashboard, script, upload, rtde or controller (what it did by itself)."""
         self._counts[f"{source}: {verb}"] += 1
-        now_ns = time.monotonic_ns()
-        entry = {"monotonic_ns": now_ns, "source": source, "verb": verb, **details}
-        self._entries.append((now_ns, entry))
+        self._entries.append({"monotonic_ns": time.monotonic_ns(), "source": source, "verb": verb, **details})
 
     def count(self, source: str, verb: str) -> None:
         """Count what comes many times a second."""
@@ -121,8 +119,8 @@ class Journal:
     def counts(self) -> dict[str, int]:
         return dict(self._counts)
 
-    def entries(self, since_ns: int = 0) -> list[dict[str, object]]:
-        return [entry for at_ns, entry in self._entries if at_ns >= since_ns]
+    def entries(self, since_ns: int = 0) -> list[dict[str, Any]]:
+        return [entry for entry in self._entries if entry["monotonic_ns"] >= since_ns]
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ CELLS = [
     ("paper", "eye-in-hand", 0),
     ("paper", "eye-in-hand", 3),
     ("paper", "eye-to-hand", 1),
-    ("blog", "eye-in-hand", 0),
 ]
 
 

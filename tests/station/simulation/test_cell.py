@@ -1,4 +1,4 @@
-"""Simulated cells: the published scenes as published, other seeds truly other, and all of them usable."""
+"""Simulated cells: the paper's as published, other seeds truly other, and all of them usable."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, is_rigid, transform_points
 from calibrate.kinematics import MODELS, forward
-from station.cell.config import BLOG_BOARD, PAPER_BOARD
+from station.cell.config import PAPER_BOARD
 from station.simulation.cells import board_centre, cell_config, make_cell
 from station.simulation.truth import CellTruth, read_truth, write_truth
 
@@ -32,14 +32,6 @@ def test_the_papers_scene_is_the_default() -> None:
     assert np.allclose(X[:3, 3], [-0.0013, -0.0603, 0.0870])
     place = np.array(cell.board_place)
     assert place[2, 3] == pytest.approx(0.0, abs=1e-9) and place[2, 2] == pytest.approx(-1.0)
-
-
-def test_the_blogs_scene_has_its_lens_board_and_answer() -> None:
-    cell = make_cell("blog")
-    assert cell.board == BLOG_BOARD and (cell.camera.width, cell.camera.height) == (960, 720)
-    assert 2 * np.degrees(np.arctan(360 / cell.camera.matrix[1][1])) == pytest.approx(31.0482)
-    printed = np.array([[0.965926, 0, -0.258819, 0.1], [0, 1, 0, 0], [0.258819, 0, 0.965926, 0]])
-    assert np.abs(np.array(cell.camera_mount)[:3] - printed).max() < 1e-6
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])

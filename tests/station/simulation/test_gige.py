@@ -22,7 +22,7 @@ def test_it_does_not_run_beside_other_networks() -> None:
     if is_isolated():
         pytest.skip("this machine has nothing but lo")
     with raises("not-isolated"):
-        start_gige()
+        start_gige("", Path(), "")
 
 
 @pytest.mark.gige
@@ -33,7 +33,7 @@ async def test_its_pictures_show_the_board_from_where_the_arm_stands(
     cell = make_cell(seed=2)
     write_truth(cell, tmp_path / "truth.json")
     arm = controller(truth=tmp_path / "truth.json")
-    with start_gige(arm.host, truth=tmp_path / "truth.json", serial="SIM00002"):
+    with start_gige(arm.host, tmp_path / "truth.json", "SIM00002"):
         async with opened(packet_size=8996, exposure_us=10_000.0) as camera:
             picture = await camera.capture()
             assert detect(picture.pixels, cell.board).found

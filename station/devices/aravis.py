@@ -54,34 +54,34 @@ class AravisCamera:
             return await self._worker.run(lambda: self._live().settings())
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        async with self._busy:
-            return await self._one(timeout_s, sequenced=True)
+        # Whoever waits may be cancelled; a trigger and its frame stay together, or the next one gets that frame.
+        return await asyncio.shield(self._one(timeout_s))
 
     async def glimpse(self) -> Image:
         """Take an image that is not recorded, triggered like any other, by the trigger box too."""
-        async with self._busy:
-            return await self._one(_GLIMPSE_S, sequenced=False)
+        return await self.capture(_GLIMPSE_S)
 
-    async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
-        await self._worker.run(self._prepare)
-        pulse: TriggerPulse | None = None
-        asked_ns = time.monotonic_ns()
-        if self._config.trigger == "hardware":
-            assert self._trigger is not None
-            pulse = await self._trigger.fire()
-        count = None if pulse is None else pulse.count
-        try:
-            picture = await self._worker.run(partial(self._take, timeout_s))
-        except CameraError:
-            self.counter.lost(count)
-            raise
-        sequence = self.counter.accept(picture.frame_id, count, sequenced=sequenced)
-        # Read after the exposure: a change during it must show, too.
-        exposure_us, gain_db = await self._worker.run(lambda: self._live().check_settings())
-        told = msgspec.structs.replace(
-            picture, sequence=sequence, trigger_count=count, exposure_us=exposure_us, gain_db=gain_db
-        )
-        return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
+    async def _one(self, timeout_s: float) -> Image:
+        async with self._busy:
+            await self._worker.run(self._prepare)
+            pulse: TriggerPulse | None = None
+            asked_ns = time.monotonic_ns()
+            if self._config.trigger == "hardware":
+                assert self._trigger is not None
+                pulse = await self._trigger.fire()
+            count = None if pulse is None else pulse.count
+            try:
+                picture = await self._worker.run(partial(self._take, timeout_s))
+            except CameraError:
+                self.counter.lost(count)
+                raise
+            self.counter.accept(picture.frame_id, count)
+            # Read after the exposure: a change during it must show, too.
+            exposure_us, gain_db = await self._worker.run(lambda: self._live().check_settings())
+            told = msgspec.structs.replace(
+                picture, trigger_count=count, exposure_us=exposure_us, gain_db=gain_db
+            )
+            return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
 
     async def close(self) -> None:
         device, self._device = self._device, None
@@ -112,10 +112,11 @@ class AravisCamera:
         device.latch(self._clock.readings)
 
     def _take(self, timeout_s: float) -> Image:
-        device = self._live()
+        """Trigger and wait for the frame, by `timeout_s` longer than its exposure takes."""
+        device, limit_s = self._live(), timeout_s + self._config.exposure_us / 1e6
         if self._config.trigger == "software":
             device.trigger()
-        picture = device.frame(timeout_s)
+        picture = device.frame(limit_s)
         if picture is None:
-            raise CameraError("no-image", limit_s=timeout_s)
+            raise CameraError("no-image", limit_s=limit_s)
         return picture

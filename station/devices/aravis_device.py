@@ -150,9 +150,9 @@ class GenicamDevice:
             ("GevTimestampControlLatch", "GevTimestampValue"),
             ("TimestampLatch", "TimestampLatchValue"),
         ):
-            if not self._camera.is_feature_available(command):
-                continue
             with self._explained("reading the camera's clock"):
+                if not self._camera.is_feature_available(command):
+                    continue
                 if self._latched_ns is None:  # an earlier client's latched value is not the time now
                     self._latched_ns = self._to_ns(self._camera.get_integer(value))
                 asked_ns = time.monotonic_ns()
@@ -223,9 +223,9 @@ class GenicamDevice:
     def _calm_down(self) -> None:
         """Lengthen the gaps between packets after a frame that lost some."""
         camera = self._camera
-        if not camera.is_gv_device() or not camera.is_feature_available("GevSCPD"):
-            return
-        with suppress(self._glib.Error):  # beyond the camera's range: keep the present gap
+        with suppress(self._glib.Error):  # beyond the camera's range, or it is lost: keep the present gap
+            if not camera.is_gv_device() or not camera.is_feature_available("GevSCPD"):
+                return
             size = camera.gv_get_packet_size()
             packets = camera.get_payload() // size + 1
             gap_ns = max(

@@ -190,9 +190,11 @@ class Camera(Protocol):
         """Open the camera and read its identity. Raises CameraError with the remedy."""
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        """Trigger once and return that frame with its `time`, never an older one. Raises CameraError.
+        """Trigger once and return that frame with its `time`, never an older one. Raises CameraError when
+        it does not come within its exposure and `timeout_s`.
 
-        Drivers get the time from `frames.FrameClock`, or fill in source and bound themselves.
+        Drivers get the time from `frames.FrameClock`, or fill in source and bound themselves. The recording
+        numbers it.
         """
 
     @property
@@ -209,9 +211,9 @@ class Camera(Protocol):
         """
 
     async def glimpse(self) -> Image:
-        """Take an image, exposed after this call and of any size, that is not numbered or recorded.
+        """Take an image, exposed after this call and of any size, that is not recorded.
 
-        For screens, and to see whether something moves. Raises CameraError within about a second.
+        For screens, and to see whether something moves. Raises CameraError about a second after its exposure.
         """
 
     async def close(self) -> None: ...

@@ -26,11 +26,8 @@ class FrameCounter:
     """
 
     def __init__(self) -> None:
-        self.frames = 0
-        """Numbered frames accepted; the newest has this sequence number minus 1."""
-        self.missing = 0
-        self.seen = 0
-        """Frames accepted, glimpses included."""
+        self.frames = self.missing = 0
+        """Frames accepted, and triggers or frame ids without one."""
         self.paired = 0
         """Frames accepted for a pulse of the trigger box."""
         self._last_id: int | None = None
@@ -40,10 +37,9 @@ class FrameCounter:
         """Accept any next frame id: call after opening the camera or restarting acquisition."""
         self._last_id = self._last_pulse = None
 
-    def accept(self, frame_id: int | None, pulse_count: int | None = None, *, sequenced: bool = True) -> int:
-        """Check a frame; return its sequence number. `pulse_count`: of the trigger box, for this trigger.
+    def accept(self, frame_id: int | None, pulse_count: int | None = None) -> None:
+        """Check a frame. `pulse_count`: of the trigger box, for this trigger.
 
-        `sequenced=False`: a glimpse, which takes no sequence number.
         Raises CameraError for a frame that is not the next one or a pulse count that did not grow by one.
         """
         last_id, last_pulse = self._last_id, self._last_pulse
@@ -59,13 +55,11 @@ class FrameCounter:
             raise CameraError("frames-lost", frames=frames - 1, after=last_id, frame=frame_id)
         if pulses != 1:
             raise CameraError("pulse-count", pulses=pulses)
-        self.frames += sequenced
-        self.seen += 1
+        self.frames += 1
         self.paired += pulse_count is not None
-        return self.frames - 1
 
     def counts(self) -> CameraCounts:
-        return CameraCounts(self.seen, self.missing, self.paired)
+        return CameraCounts(self.frames, self.missing, self.paired)
 
     def lost(self, pulse_count: int | None = None) -> None:
         """Note a trigger without a frame; `pulse_count`: count of the trigger box at it."""
@@ -142,12 +136,11 @@ def by_clock(start_device_ns: int, exposure_us: float, fit: ClockFit, source: Ti
 def by_trigger(fired_ns: int, fired_bound_s: float, exposure_us: float, arrival_ns: int) -> FrameTime:
     """Time a frame by the pulse of a trigger box.
 
-    What the camera adds of its own is not known: the bound is all that lies between pulse and arrival.
+    What the camera adds of its own is not known: the bound is all that lies between pulse and arrival. A
+    frame that came sooner than its exposure takes contradicts its pulse, and its bound grows by as much.
     """
     left_s = (arrival_ns - exposure_us * 1000 - fired_ns) / 1e9
-    return FrameTime(
-        fired_ns + round(exposure_us * 500), max(fired_bound_s, fired_bound_s + left_s), "trigger"
-    )
+    return FrameTime(fired_ns + round(exposure_us * 500), fired_bound_s + abs(left_s), "trigger")
 
 
 def by_arrival(
@@ -156,12 +149,14 @@ def by_arrival(
     """Time a frame by its first packet: the exposure began after it was asked for, and ended before.
 
     `asked_ns`: just before its trigger; None = not triggered, then `readout_s` is what can lie between.
+    A frame that came sooner after its trigger than its exposure takes, such as a late answer to an earlier
+    trigger, is bounded by the contradiction.
     """
     exposure_ns = round(exposure_us * 1000)
     latest_ns = arrival_ns - exposure_ns
-    earliest_ns = latest_ns - round(readout_s * 1e9) if asked_ns is None else min(asked_ns, latest_ns)
+    earliest_ns = latest_ns - round(readout_s * 1e9) if asked_ns is None else asked_ns
     middle_ns = (earliest_ns + latest_ns) // 2 + exposure_ns // 2
-    return FrameTime(middle_ns, (latest_ns - earliest_ns) / 2e9, "arrival")
+    return FrameTime(middle_ns, abs(latest_ns - earliest_ns) / 2e9, "arrival")
 
 
 class FrameClock:

@@ -28,11 +28,11 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
     camera.set_range_check_policy(aravis.RangeCheckPolicy.ENABLE)
     camera.stop_acquisition()
     camera.clear_triggers()
-    for automatic in ("ExposureAuto", "GainAuto"):
-        if camera.is_feature_available(automatic):
-            camera.set_string(automatic, "Off")
+    # Cameras keep what the last program set: automatic functions, or an exposure as long as the pulse.
+    for name, value in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("ExposureMode", "Timed")):
+        if camera.is_feature_available(name):
+            camera.set_string(name, value)
     camera.set_pixel_format_from_string(config.pixel_format)
-    # Cameras keep the region that the last program set.
     region: Region = config.region or (0, 0, *camera.get_sensor_size())
     camera.set_region(*region)
     camera.set_exposure_time(config.exposure_us)

@@ -72,7 +72,6 @@ class PlaybackCamera:
             picture,
             stamps=Stamps(host_monotonic_ns=now_ns, host_wall_ns=time.time_ns(), device_ns=now_ns),
             frame_id=self._taken,
-            sequence=self._taken - 1,
             time=FrameTime(now_ns, _STAMP_BOUND_S, "latched"),
         )
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import cv2
-import msgspec
 import numpy as np
 
 from recordings.schema.messages import CameraIdentity, Image, Stamps
@@ -48,7 +47,7 @@ class WebcamCamera:
         self._worker = DeviceThread("webcam")
         self._fixed: dict[str, float] = {}
         """Exposure and focus at opening; only those that the camera has"""
-        self._frames = self._seen = self._missing = 0
+        self._frames = self._missing = 0
         self.identity = CameraIdentity(driver="webcam")
 
     @property
@@ -56,7 +55,7 @@ class WebcamCamera:
         return FrameTiming("arrival", LATENCY_S / 2) if self._video is not None else None
 
     def counts(self) -> CameraCounts:
-        return CameraCounts(frames=self._seen, missing=self._missing)
+        return CameraCounts(frames=self._frames, missing=self._missing)
 
     async def open(self) -> CameraIdentity:
         await self._run(self._open, _OPEN_S)
@@ -65,11 +64,10 @@ class WebcamCamera:
     async def capture(self, timeout_s: float = 5.0) -> Image:
         """Return a frame whose exposure began after this call; takes `LATENCY_S` longer than a frame."""
         try:
-            image = await self._run(partial(self._fresh, timeout_s), timeout_s)
+            return await self._run(partial(self._fresh, timeout_s), timeout_s)
         except CameraError:
             self._missing += 1
             raise
-        return self._numbered(image)
 
     async def settings(self) -> dict[str, object]:
         return await self._run(self._settings, _GLIMPSE_S)
@@ -180,7 +178,7 @@ class WebcamCamera:
         good, pixels = video.retrieve()
         if not good:
             raise CameraError("frame-incomplete", reason="it cannot be decoded")
-        self._seen += 1
+        self._frames += 1
         if grey := self._config.pixel_format.startswith("Mono"):
             pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
         age_ns = time.monotonic_ns() - arrived_ns
@@ -199,10 +197,6 @@ class WebcamCamera:
         """Read the exposure (µs); 0 where the camera does not tell."""
         return self._fixed.get("exposure_us", 0.0)
 
-    def _numbered(self, image: Image) -> Image:
-        self._frames += 1
-        return msgspec.structs.replace(image, sequence=self._frames - 1)
-
 
 def _wanted_size(config: CameraConfig) -> tuple[int, int] | None:
     """Return the configured width and height; CameraError for a region that is not at the origin."""
@@ -215,12 +209,15 @@ def _wanted_size(config: CameraConfig) -> tuple[int, int] | None:
 
 
 def _readable(video: cv2.VideoCapture) -> dict[str, float]:
-    """Read exposure (µs) and focus (camera's unit), where it has them: OpenCV returns -1 or 0 for none."""
+    """Read exposure (µs) and focus (camera's unit), where it has them: OpenCV returns -1 or 0 for none.
+
+    An automatic exposure (V4L2's modes 0, 2 and 3) is as none: it may differ in the next frame.
+    """
     known = {
         "exposure_us": video.get(cv2.CAP_PROP_EXPOSURE) * _EXPOSURE_UNIT_US,
         "focus": video.get(cv2.CAP_PROP_FOCUS),
     }
-    automatic = video.get(cv2.CAP_PROP_AUTO_EXPOSURE) not in (-1, 0, _MANUAL_EXPOSURE)
+    automatic = video.get(cv2.CAP_PROP_AUTO_EXPOSURE) not in (-1, _MANUAL_EXPOSURE)
     return {name: value for name, value in known.items() if value > 0 and not (automatic and name != "focus")}
 
 

@@ -86,14 +86,16 @@ class RenderedCamera:
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
         """Trigger once and return that frame."""
+        return await asyncio.shield(self._triggered(timeout_s))
+
+    async def _triggered(self, timeout_s: float) -> Image:
         async with self._asking:
             await self._ready()
             await self._read_clock()
             asked_ns = time.monotonic_ns()
             frame = await self._call("trigger", timeout_s=timeout_s)
-            sequence = self.counter.accept(frame.frame_id)
-            told = msgspec.structs.replace(_dated(frame), sequence=sequence)
-            return self._clock.timed(told, asked_ns=asked_ns)
+            self.counter.accept(frame.frame_id)
+            return self._clock.timed(_dated(frame), asked_ns=asked_ns)
 
     async def settings(self) -> dict[str, object]:
         return {

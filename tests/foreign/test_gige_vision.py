@@ -165,7 +165,6 @@ async def test_one_trigger_gives_one_picture_over_the_wrap_of_the_ids(emulated: 
     async with opened() as camera:
         pictures = [await camera.capture() for _ in range(12)]
     assert [p.frame_id for p in pictures] == [*range(65_530, 65_536), *range(1, 7)]
-    assert [p.sequence for p in pictures] == list(range(12))
 
 
 def test_hardware_trigger_needs_a_box() -> None:
@@ -197,7 +196,7 @@ class Unplugged:
 
 async def test_a_usb_camera_that_was_pulled_out_is_opened_again(emulated: EmulatedCamera) -> None:
     async with opened() as camera:
-        first = await camera.capture()
+        await camera.capture()
         device = camera._device
         aravis, glib = device._aravis, device._glib
         code = aravis.DeviceError.NOT_CONNECTED
@@ -208,9 +207,8 @@ async def test_a_usb_camera_that_was_pulled_out_is_opened_again(emulated: Emulat
         with raises("camera-refused"):
             await camera.capture()
         assert device.lost
-        second = await camera.capture()
-        assert camera._device is not device
-    assert second.sequence == first.sequence + 1
+        await camera.capture()
+        assert camera._device is not device and camera.counts().frames == 2
 
 
 async def test_a_refused_setting_does_not_count_as_a_lost_camera(emulated: EmulatedCamera) -> None:

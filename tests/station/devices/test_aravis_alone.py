@@ -105,6 +105,23 @@ async def test_a_frame_that_nobody_asked_for_costs_the_pose_not_the_next() -> No
     await camera.close()
 
 
+class Slow(Device):
+    """Its frame is there when its exposure is over, and not before."""
+
+    def trigger(self) -> None: ...
+
+    def frame(self, timeout_s: float) -> Any:
+        return Image(np.zeros((2, 2), np.uint8), Stamps(10**9), 1, 0) if timeout_s > 3.0 else None
+
+
+async def test_a_long_exposure_is_waited_for_or_its_frame_would_be_the_next_ones() -> None:
+    camera = opened(Slow(), CameraConfig(exposure_us=3e6))
+    for take in (camera.glimpse, camera.capture):
+        assert (await take()).frame_id == 1
+        camera.counter.restart()
+    await camera.close()
+
+
 class Turned(Device):
     """Somebody turns a knob while it exposes."""
 
@@ -201,6 +218,7 @@ def test_the_whole_sensor_is_set_with_the_right_trigger_and_automatics_off(trigg
     assert camera.set["set_region"] == REGION and camera.set.get("set_trigger") == line
     assert camera.set["set_string ExposureAuto"] == ("ExposureAuto", "Off")
     assert camera.set["set_string GainAuto"] == ("GainAuto", "Off")
+    assert camera.set["set_string ExposureMode"] == ("ExposureMode", "Timed"), "not as long as the pulse"
     assert camera.set["set_acquisition_mode"] == ("continuous",) and camera.set["set_chunk_mode"] == (False,)
 
 

@@ -21,6 +21,7 @@ class Controls:
     """`cv2.VideoCapture` on a film, with the controls that V4L2 has and a film has not."""
 
     autofocus_stays = False
+    automatic_stays: float | None = None
     gone = False
     values: dict[int, float]
 
@@ -35,6 +36,8 @@ class Controls:
     def set(self, name: int, value: float) -> bool:
         if name == cv2.CAP_PROP_AUTOFOCUS and self.autofocus_stays:
             return False
+        if name == cv2.CAP_PROP_AUTO_EXPOSURE and self.automatic_stays is not None:
+            value = self.automatic_stays
         Controls.values[name] = value
         return True
 
@@ -68,8 +71,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def controls(quick: None, monkeypatch: pytest.MonkeyPatch) -> type[Controls]:
     monkeypatch.setattr(webcam.cv2, "VideoCapture", Controls)
-    for name in ("autofocus_stays", "gone"):
-        monkeypatch.setattr(Controls, name, False)
+    for name in ("autofocus_stays", "automatic_stays", "gone"):
+        monkeypatch.setattr(Controls, name, None)
     return Controls
 
 
@@ -112,6 +115,19 @@ async def test_exposure_is_set_and_focus_held(controls: type[Controls], pictures
     await camera.close()
 
 
+@pytest.mark.parametrize("mode", [0.0, 3.0])
+async def test_an_exposure_that_stays_automatic_is_not_told_as_one(
+    controls: type[Controls], pictures: str, mode: float
+) -> None:
+    """V4L2 has three automatic modes, 0 among them; what the camera tells of its exposure is of a moment."""
+    controls.automatic_stays = mode
+    camera = WebcamCamera(CameraConfig(driver="webcam", device=pictures))
+    await camera.open()
+    assert (await camera.capture()).exposure_us == 0.0
+    assert "exposure_us" not in await camera.settings()
+    await camera.close()
+
+
 async def test_an_autofocus_that_stays_on_is_refused(controls: type[Controls], pictures: str) -> None:
     controls.autofocus_stays = True
     with raises("autofocus"):
@@ -136,7 +152,8 @@ async def test_a_webcam_that_is_gone_is_opened_again(controls: type[Controls], p
     with raises("camera-gone"):
         await camera.capture()
     controls.gone = False
-    assert (await camera.capture()).sequence == 1
+    await camera.capture()
+    assert (camera.counts().frames, camera.counts().missing) == (2, 1)
     await camera.close()
 
 

@@ -54,7 +54,7 @@ class AravisCamera:
             return await self._worker.run(lambda: self._live().settings())
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        # Whoever waits may be cancelled; a trigger and its frame stay together, or the next one gets that frame.
+        # A trigger and its frame stay together even if the caller is cancelled, or the next gets that frame.
         return await asyncio.shield(self._one(timeout_s))
 
     async def glimpse(self) -> Image:

@@ -18,7 +18,6 @@ from station.devices.frames import TriggerPulse
 ANSWER_TIMEOUT_S = 1.0
 HANDSHAKE_TIMEOUT_S = 3.0
 """Time for the first answer: many boards restart when their port is opened, which takes two seconds."""
-GARBLED_LIMIT = 50
 _COUNTS = 1 << 32
 LINE_LIMIT = 120
 """Longest valid line, bytes."""
@@ -138,18 +137,13 @@ class SerialTrigger:
 
     def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
         """Send a request; return the first fields of its answer. Other lines are skipped."""
-        port, garbled = self._require_port(), 0
+        port = self._require_port()
         end_s = time.monotonic() + timeout_s
         try:
             port.reset_input_buffer()
             port.write(frame(request))
             while time.monotonic() < end_s:
-                line = port.read_until(b"\n", LINE_LIMIT)
-                text = unframe(line)
-                garbled += bool(line) and text is None
-                if garbled > GARBLED_LIMIT:
-                    raise TriggerError("garbled-lines", what=f"more than {GARBLED_LIMIT} garbled lines")
-                words = (text or "").split()
+                words = (unframe(port.read_until(b"\n", LINE_LIMIT)) or "").split()
                 if words[:1] == [answer] and len(words) > fields:
                     return words[1 : fields + 1]
                 if words[:1] == ["ERR"]:

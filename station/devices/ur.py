@@ -39,6 +39,8 @@ TOOL_S = 0.04
 ONE_WAY_S = 1.0
 STOP_WAIT_S = 0.05
 PROGRAM_START_S = 0.2
+UPLOADED_S = 1.0
+"""Within this time after its upload a control program has started, or will not."""
 LEFTOVER_WAIT_S = 2.0
 CLOSE_WAIT_S = 0.5
 
@@ -154,10 +156,12 @@ class UrRobot(UrLink):
         trouble, ended = self._trouble, self._ended_by
         if trouble is not None and ended is not None and trouble.data == ended.data:
             self._trouble = None
-        if child is None:
-            return
+        if child is not None:
+            await asyncio.shield(self._later(self._end(child)))
+
+    async def _end(self, child: ControlChild) -> None:
         await child.end()
-        await self._stop_leftover_program()
+        await self._stop_leftover_program(child)
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Move the joints; return on arrival. Any other end of the move stops the arm and ends control.
@@ -299,16 +303,22 @@ class UrRobot(UrLink):
             ending.append(self._dashboard_stop_anew())
         await asyncio.gather(*ending)
         if child is not None:
-            await self._stop_leftover_program()
+            await self._stop_leftover_program(child)
 
-    async def _stop_leftover_program(self) -> None:
+    async def _stop_leftover_program(self, child: ControlChild) -> None:
         """Stop a program that a killed child left playing, or that starts only now.
 
-        It moves nothing, but would look like another client's. Waits for news newer than the kill.
+        It moves nothing, but would look like another client's. Waits for news newer than the kill; longer
+        where the child was killed before its program was ready, as that may still be on its way.
         """
-        state = await self.state_after(time.monotonic() + PROGRAM_START_S, LEFTOVER_WAIT_S)
-        if state is not None and state.runtime_state == RuntimeState.PLAYING and self._child is None:
-            await self._dashboard_stop_anew()
+        look_s = time.monotonic() + PROGRAM_START_S
+        until_s = look_s if child.started_s else look_s + UPLOADED_S
+        while (state := await self.state_after(look_s, LEFTOVER_WAIT_S)) is not None and self._child is None:
+            if state.runtime_state == RuntimeState.PLAYING:
+                await self._dashboard_stop_anew()
+                return
+            if (look_s := time.monotonic()) > until_s:
+                return
 
     async def _dashboard_stop_anew(self) -> None:
         try:
@@ -370,10 +380,11 @@ class UrRobot(UrLink):
     def _why_stopped(self) -> str:
         return f" ({self._stop_reason})" if self._stop_reason else ""
 
-    def _later(self, work: Coroutine[object, object, object]) -> None:
+    def _later(self, work: Coroutine[object, object, object]) -> asyncio.Task[object]:
         task = asyncio.get_running_loop().create_task(work)
         self._background.add(task)
         task.add_done_callback(self._background.discard)
+        return task
 
 
 def _stopped(how: str = "") -> RobotError:

@@ -78,7 +78,7 @@ class ControlChild:
         self._beat_ns = 0
         self._answered_ns = 0
         self.started_s = 0.0
-        """When the control program was ready (host monotonic)."""
+        """When the control program was ready (host monotonic); 0: not yet."""
         self.kicks_s: deque[float] = deque(maxlen=KEPT)
         """When the newest heartbeats reset the watchdog (host monotonic)."""
         self.stop_acknowledged: asyncio.Future[None] = self._loop.create_future()
@@ -124,7 +124,6 @@ class ControlChild:
             self.kill()
             await self.reap()
             raise self._trouble(f"was not ready within {timeout_s:g} s and was killed") from None
-        self.started_s = time.monotonic()
         self._beat_ns = 0  # heartbeats unanswered until now are no sign that the process hangs
         if answer.refused is not None or answer.died:
             self.kill()
@@ -133,6 +132,7 @@ class ControlChild:
             raise self._death()
         if (told := answer.refused) is not None:
             raise RobotError.from_data(told)
+        self.started_s = time.monotonic()
         return answer.tcp or None
 
     async def heard(self) -> None:

@@ -4,7 +4,8 @@ The script is uploaded once. Every RTDE data packet carries everything: sequence
 speed, acceleration. A verb is carried out once, when its sequence is new; the script answers with that
 sequence, negative if it refuses. Once armed, the script ends when the keepalive does not change for 0.2 s: it
 kills the thread that moves, brakes and halts, as Universal Robots' own library does. It ends the same way for
-any other reason. A lost connection is never reopened, and the script ends with it.
+any other reason. One that nobody arms ends after 20 s. A lost connection is never reopened, and the script
+ends with it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ FIRST_REGISTER = 24
 """First register used: the upper half is for RTDE clients, the lower for field buses."""
 SILENCE_S = 0.2
 """Time without a new keepalive after which the script stops the arm and ends."""
+UNARMED_S = 20.0
+"""The same before the watchdog is armed: whoever started the script has died."""
 RATE_HZ = 125.0
 START_S = 5.0
 SETTLE_SAMPLES = 5
@@ -115,10 +118,10 @@ def station_control():
     if alive != kept:
       kept = alive
       silence = 0.0
-    elif armed:
+    else:
       silence = silence + get_steptime()
     end
-    if silence > {silence}:
+    if (silence > {unarmed}) or (armed and (silence > {silence})):
       obeying = False
     elif sequence != seen:
       seen = sequence
@@ -169,9 +172,9 @@ def script(sequence: int) -> str:
     """Make the program; it starts only if its sequence register holds this value."""
     return SCRIPT.format(
         r=FIRST_REGISTER, sequence=sequence, joint_limit=2 * math.pi, speed_limit=JOINT_SPEED_LIMIT_RAD_S,
-        acceleration_limit=JOINT_ACCELERATION_LIMIT_RAD_S2, silence=SILENCE_S, stop=STOP_RAD_S2,
-        arm=int(Command.ARM), move=int(Command.MOVE), waiting=int(State.WAITING), armed=int(State.ARMED),
-        moving=int(State.MOVING), ended=int(State.ENDED),
+        acceleration_limit=JOINT_ACCELERATION_LIMIT_RAD_S2, silence=SILENCE_S, unarmed=UNARMED_S,
+        stop=STOP_RAD_S2, arm=int(Command.ARM), move=int(Command.MOVE), waiting=int(State.WAITING),
+        armed=int(State.ARMED), moving=int(State.MOVING), ended=int(State.ENDED),
     )  # fmt: skip
 
 

@@ -13,7 +13,6 @@ big-endian. Source: Universal Robots, "Remote control via TCP/IP: client interfa
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import math
 import struct
@@ -42,7 +41,6 @@ CARTESIAN_INFO = 4
 KINEMATICS_INFO = 5
 MESSAGE_LIMIT = 64 * 1024
 SILENCE_S = 3.0
-FIRST_S = 1.0
 _HEADER = struct.Struct(">iB")
 _CARTESIAN = struct.Struct(">12d")
 """TCP pose, then TCP offset: x y z [m], rotation vector [rad] each"""
@@ -53,6 +51,7 @@ _KEY = struct.Struct(">QbBiiB")
 NOMINAL_TOLERANCE = (0.006, math.radians(1.0))
 CALIBRATED_TOLERANCE = (0.0005, math.radians(0.1))
 STATED_TOLERANCE = (1e-6, 1e-6)
+LATE_TOLERANCE = (1e-4, math.radians(0.01))
 FACTORY_LIMIT = (0.02, math.radians(2.0))
 LONGEST_M = 1.0
 PAYLOAD_TOLERANCE_KG = 0.005
@@ -124,10 +123,8 @@ class PrimaryReader:
         self._task = asyncio.create_task(self._run(), name=f"installation of {host}")
 
     async def first(self) -> Installation:
-        """Wait for the first message; empty when none comes in time (firewall, old controller)."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(FIRST_S):
-                await self._first.wait()
+        """Wait for the first state; empty when the port is closed, or none comes in time (firewall)."""
+        await self._first.wait()
         return self.installation
 
     async def _run(self) -> None:
@@ -154,8 +151,7 @@ class PrimaryReader:
     def _learn(self, news: Installation) -> None:
         known = self.installation
         self.installation = Installation(news.tcp_offset or known.tcp_offset, news.dh or known.dh)
-        if self.installation.tcp_offset is not None:
-            self._first.set()
+        self._first.set()
 
     async def close(self) -> None:
         self._task.cancel()
@@ -179,7 +175,7 @@ class TcpCheck:
         self._model = model
         self._tolerance = CALIBRATED_TOLERANCE if calibrated else NOMINAL_TOLERANCE
         self._source: Literal["controller", "configuration"] | None = "configuration" if calibrated else None
-        self._stated = self._told = installation.tcp_offset
+        self._stated = installation.tcp_offset
         if not calibrated and installation.dh is not None and self._stated is not None:
             theta, a, d, alpha = installation.dh
             stated = replace(model, theta_rad=theta, a_m=a, d_m=d, alpha_rad=alpha)
@@ -228,14 +224,16 @@ class TcpCheck:
         _compare(self._first, _pose(stated), self._tolerance, "tcp-mismatch", self._model.name)
 
     def check(self, state: RobotState, installation: Installation) -> None:
-        """Raise RobotError when the TCP on the pendant differs from that at connect.
+        """Raise RobotError when the TCP on the pendant differs from that at connect, or from the one derived
+        there because the controller did not state it.
 
         In motion the tolerance of the tool pose is larger, that of the stated offset is not.
         """
-        offset = installation.tcp_offset
-        self._told = self._told or offset  # the first statement may come late
-        if self._told is not None and offset is not None and offset != self._told:
-            _compare(_pose(offset), _pose(self._told), STATED_TOLERANCE, "tcp-changed", self._model.name)
+        if (offset := installation.tcp_offset) is not None and offset != self.offset:
+            tolerance, code = STATED_TOLERANCE, "tcp-changed"
+            if self._stated is None:  # first stated after connecting: poses were computed with another one
+                tolerance, code = LATE_TOLERANCE, "tcp-late"
+            _compare(_pose(offset), _pose(self.offset), tolerance, code, self._model.name)
         now = _flange_from_tcp(self._model, state)
         turned_rad = SKEW_S * sum(map(abs, state.joint_speeds_rad_s))
         reach_m = float(np.linalg.norm(state.tcp_pose[:3])) + LONGEST_M

@@ -25,8 +25,8 @@ from tests.gige_vision.pixels import encode, numbered_picture
 
 CONTROL_PORT = 3956
 _RESEND, _TICK_HZ = 0x0040, 125_000_000
-_NOT_IMPLEMENTED, _INVALID_PARAMETER, _INVALID_ADDRESS = 0x8001, 0x8002, 0x8003
-_WRITE_PROTECT, _ACCESS_DENIED, _UNAVAILABLE, _RESENT = 0x8004, 0x8006, 0x800C, 0x0100
+_NOT_IMPLEMENTED, _INVALID_ADDRESS = 0x8001, 0x8003
+_ACCESS_DENIED, _UNAVAILABLE, _RESENT = 0x8006, 0x800C, 0x0100
 _PRIVILEGE, _HEARTBEAT, _CAPABILITY = 0xA00, 0x938, 0x934
 _STREAM_PORT, _STREAM_ADDRESS = 0xD00, 0xD18
 _CAPABILITIES = (
@@ -237,10 +237,6 @@ class EmulatedCamera:
             raise _RefusedError(_ACCESS_DENIED)
         if address % 4 or address + len(data) > len(self._memory):
             raise _RefusedError(_INVALID_ADDRESS)
-        if address < 0x200 or at.TICK_HZ <= address < at.TIMESTAMP_CONTROL:
-            raise _RefusedError(_WRITE_PROTECT)
-        if (address == at.WIDTH and value > self.size[0]) or (address == at.HEIGHT and value > self.size[1]):
-            raise _RefusedError(_INVALID_PARAMETER)
         self._memory[address : address + len(data)] = data
         match address:
             case at.TIMESTAMP_CONTROL if value & _LATCH:

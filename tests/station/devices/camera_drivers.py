@@ -6,6 +6,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, ExitStack, asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -62,30 +63,17 @@ def playback(request: pytest.FixtureRequest) -> Driver:
     return Driver(PlaybackCamera(PlaybackRobot(record(folder / "session.mcap", joints=True))))
 
 
-def aravis(request: pytest.FixtureRequest) -> Driver:
-    """GigE Vision packets of the camera that does not share Aravis."""
+def aravis(request: pytest.FixtureRequest, hardware: bool = False) -> Driver:
+    """GigE Vision packets of the camera that does not share Aravis; `hardware`: fired by a trigger box."""
     request.getfixturevalue("lonely_network")
-    ends = ExitStack()
+    ends, trigger = ExitStack(), None
     device = ends.enter_context(EmulatedCamera(size=SIZE))
-    config = CameraConfig(device="127.0.0.1", exposure_us=1000.0)
-    return Driver(
-        AravisCamera(config),
-        None,
-        lambda: silent(device),
-        exposure_of(device),
-        ends,
-    )
-
-
-def trigger_box(request: pytest.FixtureRequest) -> Driver:
-    """The same camera, each picture fired by a box on a serial line."""
-    request.getfixturevalue("lonely_network")
-    ends = ExitStack()
-    device = ends.enter_context(EmulatedCamera(size=SIZE))
-    box = ends.enter_context(SimulatedTriggerBox(device.pulse))
-    config = CameraConfig(device="127.0.0.1", exposure_us=1000.0, trigger="hardware")
-    trigger = SerialTrigger(TriggerConfig(box.port))
-    return Driver(AravisCamera(config, trigger), trigger, lambda: silent(device), exposure_of(device), ends)
+    if hardware:
+        box = ends.enter_context(SimulatedTriggerBox(device.pulse))
+        trigger = SerialTrigger(TriggerConfig(box.port))
+    kind = "hardware" if hardware else "software"
+    camera = AravisCamera(CameraConfig(device="127.0.0.1", exposure_us=1000.0, trigger=kind), trigger)
+    return Driver(camera, trigger, lambda: silent(device), exposure_of(device), ends)
 
 
 def exposure_of(device: EmulatedCamera) -> Callable[[Image], tuple[int, int]]:
@@ -153,6 +141,6 @@ DRIVERS: dict[str, Callable[[pytest.FixtureRequest], Driver]] = {
     "rendered": rendered,
     "playback": playback,
     "aravis": aravis,
-    "aravis with a trigger box": trigger_box,
+    "aravis with a trigger box": partial(aravis, hardware=True),
     "webcam": film,
 }

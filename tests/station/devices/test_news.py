@@ -11,7 +11,6 @@ import pytest
 
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.config import RobotConfig
-from station.cell.errors import StaleStateError
 from station.devices import ur_end_cause
 from station.devices.base import fresh
 from station.devices.news import Delay, Evidence, is_loopback, largest_gap, longest_silence_s
@@ -49,32 +48,29 @@ def link(age_s: float, *, moving: bool = False, **how: Any) -> UrLink:
     return made
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_news_of_a_moment_ago_are_taken(moving: bool) -> None:
-    assert link(0.05, moving=moving).news() is not None
-
-
-@pytest.mark.parametrize(("age_s", "moving"), [(0.12, True), (0.2, True), (0.12, False), (0.8, False)])
-def test_late_news_are_waited_for(age_s: float, moving: bool) -> None:
-    assert link(age_s, moving=moving).news() is None
-
-
-@pytest.mark.parametrize(("age_s", "moving"), [(0.3, True), (1.1, False)])
-def test_there_is_an_end_to_waiting(age_s: float, moving: bool) -> None:
-    with pytest.raises(StaleStateError) as told:
-        link(age_s, moving=moving).news()
-    assert age_s <= told.value.values["age_s"] < age_s + 0.2
-
-
-@pytest.mark.parametrize("moving", [False, True])
-def test_what_waits_unread_is_read_before_anything_is_judged(moving: bool) -> None:
-    assert link(5.0, moving=moving, unread=True).news() is not None
-
-
-def test_a_connection_that_ended_is_waited_for_at_rest_only() -> None:
-    assert link(0.05, ended="reset").news() is None
-    with raises("link-lost"):
-        link(0.05, moving=True, ended="reset").news()
+@pytest.mark.parametrize(
+    ("age_s", "how", "said"),
+    [
+        *((0.05, {"moving": moving}, "now") for moving in (False, True)),
+        *((5.0, {"moving": moving, "unread": True}, "now") for moving in (False, True)),
+        *((age_s, {"moving": True}, "late") for age_s in (0.12, 0.2)),
+        *((age_s, {}, "late") for age_s in (0.12, 0.8)),
+        (0.3, {"moving": True}, "stale-state"),
+        (1.1, {}, "stale-state"),
+        (0.05, {"ended": "reset"}, "late"),
+        (0.05, {"moving": True, "ended": "reset"}, "link-lost"),
+    ],
+)
+def test_late_news_are_waited_for_longer_at_rest_after_what_came_was_read(
+    age_s: float, how: Any, said: str
+) -> None:
+    made = link(age_s, **how)
+    if said in ("now", "late"):
+        assert (made.news() is not None) == (said == "now")
+        return
+    with raises(said) as told:
+        made.news()
+    assert said == "link-lost" or age_s <= told.value.values["age_s"] < age_s + 0.2
 
 
 def test_a_resting_arm_waits_for_its_dashboard_from_when_news_are_back() -> None:

@@ -200,10 +200,8 @@ async def test_a_wrong_post_is_named_and_nothing_is_taken_until_right_ones_go_on
     await poster.rest(5)
     await until(lambda: trouble(arm) == "")
     what, code = WRONG[case]
-    began_s = time.monotonic()
     poster.say(what if isinstance(what, bytes) else {"t": poster.t + 0.01} | what)
     await until(lambda: trouble(arm) == code)
-    assert time.monotonic() - began_s < 3.0
     poster.t += 0.02 + 1e6 * (case == "milliseconds")
     for _ in range(200):
         poster.post()

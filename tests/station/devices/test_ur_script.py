@@ -17,6 +17,7 @@ from station.devices.ur_moves import JOINT_SPEED_LIMIT_RAD_S
 from station.devices.ur_script import (
     FIRST_REGISTER,
     SILENCE_S,
+    UNARMED_S,
     Command,
     ScriptControl,
     State,
@@ -109,10 +110,12 @@ def cruising(model: str = "UR10") -> Registers:
     return made
 
 
-def test_nothing_moves_at_the_start() -> None:
+def test_nothing_moves_at_the_start_and_a_script_that_nobody_arms_ends() -> None:
     made = Registers()
     made.run(3.0, kick=False)
     assert made.plays and made.state is State.WAITING and made.robot.arm.command == HOME
+    made.run(UNARMED_S, kick=False)
+    assert not made.plays and made.robot.arm.command == HOME
 
 
 @pytest.mark.parametrize("verb", [Command.NONE, Command.ARM, Command.MOVE])

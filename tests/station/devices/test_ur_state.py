@@ -87,28 +87,6 @@ async def test_every_sample_comes_once_in_order_with_the_time_of_the_controller(
     assert max(gaps) - min(gaps) < 5_000_000
 
 
-async def test_truth_is_where_the_arm_was_at_that_host_time(stream: Follow) -> None:
-    """By the admin port of the simulator, which other tests compare with."""
-    s = await stream("UR10e")
-    with s.running.admin() as admin:
-        admin.ask("hand_move", joints=[1.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0], speed_rad_s=1.0)
-        await until(lambda: s.states[-1].joints_rad[0] > 0.9)
-        zero_ns = admin.ask("state")["controller_zero_monotonic_ns"]
-        moving = [state for state in s.states if 0.1 < state.joints_rad[0] < 0.9]
-        assert len(moving) > 100
-        for state in moving[::20]:
-            at_ns = zero_ns + round(state.stamps.controller_s * 1e9)
-            truth = admin.ask("truth", at_monotonic_ns=at_ns)
-            assert truth["joints_rad"] == pytest.approx(state.joints_rad, abs=1e-9)
-            between = admin.ask("truth", at_monotonic_ns=at_ns + 1_000_000)
-            assert between["joints_rad"][0] > state.joints_rad[0]
-        soon_ns = time.monotonic_ns() + 100_000_000
-        assert admin.ask("truth", at_monotonic_ns=soon_ns)["at_monotonic_ns"] == soon_ns
-        assert time.monotonic_ns() >= soon_ns
-        with raises("simulation-refused"):
-            admin.ask("truth", at_monotonic_ns=1)
-
-
 async def test_a_reboot_ends_the_link_and_starts_at_time_zero(stream: Follow) -> None:
     s = await stream()
     with s.running.admin() as admin:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from station.cell.config import RobotConfig
 from station.devices import ur
+from station.devices.rtde import RuntimeState
 from station.devices.ur import UrRobot
 from station.devices.ur_dashboard import STOP
 
@@ -20,6 +23,8 @@ class Ways:
     def __init__(self) -> None:
         self.log: list[str] = []
         self.alive = True
+        self.started_s = time.monotonic()
+        self.ended = asyncio.Event()
         self.reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self.stop_acknowledged: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
@@ -31,6 +36,10 @@ class Ways:
         self.log.append("child stop")
 
     async def end_after_stop(self, moment_s: float) -> None:
+        self.log.append("child ends")
+
+    async def end(self) -> None:
+        await self.ended.wait()
         self.log.append("child ends")
 
     async def anew(self) -> None:
@@ -94,3 +103,38 @@ async def test_a_way_that_breaks_in_the_call_costs_neither_the_other_nor_the_end
     await robot.stop("STOP by anna")
     await robot.idle()
     assert sorted(ways.log) == reached
+
+
+def shows(robot: Any, *states: RuntimeState) -> None:
+    """Give these states of the program, one a look."""
+    left = [SimpleNamespace(runtime_state=state) for state in states]
+
+    async def state_after(moment_s: float, wait_s: float) -> Any:
+        await asyncio.sleep(moment_s - time.monotonic())
+        return left.pop(0) if left else None
+
+    robot.state_after = state_after
+
+
+@pytest.mark.parametrize("ready", [True, False])
+async def test_a_program_that_starts_only_after_its_process_was_killed_is_stopped(
+    robot: Any, ways: Ways, ready: bool
+) -> None:
+    """Killed before it was ready, its upload may be on the way; later nothing can start any more."""
+    ways.started_s *= ready
+    shows(robot, RuntimeState.STOPPED, RuntimeState.STOPPED, RuntimeState.PLAYING)
+    ways.ended.set()
+    await robot.end_control()
+    assert ways.log == ["child ends", *([] if ready else ["dashboard anew"])]
+
+
+async def test_an_end_of_control_that_is_cancelled_is_carried_out(robot: Any, ways: Ways) -> None:
+    shows(robot, RuntimeState.PLAYING)
+    ending = asyncio.create_task(robot.end_control())
+    await asyncio.sleep(0)
+    for _ in range(2):
+        ending.cancel()
+        await asyncio.wait({ending})
+    ways.ended.set()
+    await robot.idle()
+    assert ways.log == ["child ends", "dashboard anew"]

@@ -8,6 +8,7 @@ from contextlib import AbstractAsyncContextManager, ExitStack, asynccontextmanag
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import msgspec
@@ -90,10 +91,23 @@ async def silent(device: EmulatedCamera) -> AsyncIterator[None]:
 class Film:
     """`cv2.VideoCapture` on a film that runs as a webcam does: frames are due, asked for or not."""
 
-    stopped = False
+    stopped = gone = False
+    controls: ClassVar[dict[int, float]] = {}
+    """Those that V4L2 has and a film has not"""
+    stay: ClassVar[set[int]] = set()
+    """Controls that cannot be set"""
 
     def __init__(self, path: str) -> None:
         self._video, self._due_s = VideoCapture(path), 0.0
+
+    def set(self, name: int, value: float) -> bool:
+        if name in self.controls and name not in self.stay:
+            self.controls[name] = value
+            return True
+        return self._video.set(name, value)
+
+    def get(self, name: int) -> float:
+        return self.controls.get(name, self._video.get(name))
 
     def grab(self) -> bool:
         while Film.stopped:
@@ -101,7 +115,8 @@ class Film:
         now_s = time.monotonic()
         self._due_s = max(self._due_s + 1 / FILM_FPS, now_s - 4 / FILM_FPS)  # four wait in the driver's queue
         time.sleep(max(0.0, self._due_s - now_s))
-        return self._video.grab() or (self._video.set(cv2.CAP_PROP_POS_FRAMES, 0) and self._video.grab())
+        again = self._video.grab() or (self._video.set(cv2.CAP_PROP_POS_FRAMES, 0) and self._video.grab())
+        return again and not Film.gone
 
     def retrieve(self) -> tuple[bool, NDArray[np.uint8]]:
         """With the time of the exposure in the first eight pixels."""
@@ -114,15 +129,20 @@ class Film:
         return getattr(self._video, name)
 
 
-def film(request: pytest.FixtureRequest) -> Driver:
-    """The webcam's driver over a film in real time: no machine of ours has a webcam."""
-    path: Path = request.getfixturevalue("tmp_path") / "film.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FILM_FPS, SIZE)
+def shown(folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Make a film, put it in place of all webcams, and return its path."""
+    path = str(folder / "film.avi")
+    writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), FILM_FPS, SIZE)
     for number in range(50):
         writer.write(np.full((*SIZE[::-1], 3), 5 * number, np.uint8))
     writer.release()
-    request.getfixturevalue("monkeypatch").setattr(webcam.cv2, "VideoCapture", Film)
-    config = CameraConfig(driver="webcam", device=str(path))
+    monkeypatch.setattr(webcam.cv2, "VideoCapture", Film)
+    return path
+
+
+def film(request: pytest.FixtureRequest) -> Driver:
+    """The webcam's driver over a film in real time: no machine of ours has a webcam."""
+    path = shown(*map(request.getfixturevalue, ("tmp_path", "monkeypatch")))
 
     @asynccontextmanager
     async def silence() -> AsyncIterator[None]:
@@ -134,7 +154,7 @@ def film(request: pytest.FixtureRequest) -> Driver:
         exposed_ns = int.from_bytes(image.pixels[0, :8].tobytes(), "little")
         return exposed_ns, exposed_ns
 
-    return Driver(WebcamCamera(config), None, silence, exposure)
+    return Driver(WebcamCamera(CameraConfig(driver="webcam", device=path)), None, silence, exposure)
 
 
 DRIVERS: dict[str, Callable[[pytest.FixtureRequest], Driver]] = {

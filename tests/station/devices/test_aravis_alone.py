@@ -58,16 +58,14 @@ def shown_ns(device: Any, camera: Clockwork) -> list[int]:
     return [reading.device_ns for reading in clock.take_fresh()]
 
 
-def test_a_time_that_an_earlier_client_latched_is_not_now(device: Any) -> None:
-    assert shown_ns(device, Clockwork()) == [5_000]
-
-
 def test_a_clock_that_shows_no_other_time_says_nothing(device: Any) -> None:
     assert shown_ns(device, Clockwork(latched=111)) == []
 
 
 @pytest.mark.parametrize(("rate_hz", "ticks_ns"), [(0, 1), (1_000_000_000, 1), (125_000_000, 8)])
-def test_a_clock_that_ticks_slower_is_told_in_nanoseconds(device: Any, rate_hz: int, ticks_ns: int) -> None:
+def test_what_an_earlier_client_latched_is_not_now_and_ticks_are_told_in_nanoseconds(
+    device: Any, rate_hz: int, ticks_ns: int
+) -> None:
     assert shown_ns(device, Clockwork(rate_hz)) == [5_000 * ticks_ns]
 
 

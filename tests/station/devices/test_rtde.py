@@ -18,11 +18,6 @@ MOVE = Recipe(
 )
 
 
-STOP = Recipe(
-    19,
-    ("input_int_register_0", "input_double_register_0", "input_int_register_1"),
-    ("INT32", "DOUBLE", "INT32"),
-)
 SLIDER = Recipe(
     4,
     ("input_int_register_23", "speed_slider_mask", "speed_slider_fraction"),
@@ -37,8 +32,6 @@ SLIDER = Recipe(
             MOVE.pack([1, 0.0, -1.0, 1.5, 0.0, 0.0, 0.25, 1.05, 1.4, 1]),
             "004C5501" + struct.pack(">i8di", 1, 0.0, -1.0, 1.5, 0.0, 0.0, 0.25, 1.05, 1.4, 1).hex(),
         ),
-        (Recipe(4, ("input_int_register_0",), ("INT32",)).pack([0]), "0008550400000000"),
-        (STOP.pack([34, 2.0, 0]), "00145513" + struct.pack(">idi", 34, 2.0, 0).hex()),
         (SLIDER.pack([22, 1, 0.5]), "00145504" + struct.pack(">iId", 22, 1, 0.5).hex()),
         (packet(PacketType.CONTROLLER_VERSION), "000376"),
     ],

@@ -2,159 +2,124 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 
 from station.cell.config import CameraConfig, CaptureConfig
 from station.devices import webcam
 from station.devices.webcam import WebcamCamera, discover_webcams
 from tests.codes import raises
+from tests.station.devices.camera_drivers import SIZE, Film, shown
 
-SIZE = (240, 320)
-
-
-class Controls:
-    """`cv2.VideoCapture` on a film, with the controls that V4L2 has and a film has not."""
-
-    autofocus_stays = False
-    automatic_stays: float | None = None
-    gone = False
-    values: dict[int, float]
-
-    def __init__(self, path: str) -> None:
-        self._video = VideoCapture(path)
-        Controls.values = {
-            cv2.CAP_PROP_FOCUS: 30.0,
-            cv2.CAP_PROP_AUTOFOCUS: 1.0,
-            cv2.CAP_PROP_AUTO_EXPOSURE: 3.0,
-        }
-
-    def set(self, name: int, value: float) -> bool:
-        if name == cv2.CAP_PROP_AUTOFOCUS and self.autofocus_stays:
-            return False
-        if name == cv2.CAP_PROP_AUTO_EXPOSURE and self.automatic_stays is not None:
-            value = self.automatic_stays
-        Controls.values[name] = value
-        return True
-
-    def get(self, name: int) -> float:
-        return Controls.values.get(name, self._video.get(name))
-
-    def grab(self) -> bool:
-        return not self.gone and self._video.grab()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._video, name)
-
-
-VideoCapture = cv2.VideoCapture
-
-
-@pytest.fixture(scope="module")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """So many that reading them takes longer than a capture waits."""
-    folder = tmp_path_factory.mktemp("pictures")
-    for number in range(100):
-        cv2.imwrite(str(folder / f"{number:02}.png"), np.full((*SIZE, 3), 2 * number, np.uint8))
-    return str(folder / "%02d.png")
+Webcam = Callable[..., WebcamCamera]
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Webcam:
+    path = shown(tmp_path, monkeypatch)
     monkeypatch.setattr(webcam, "LATENCY_S", 0.01)
+    return lambda **config: WebcamCamera(CameraConfig(driver="webcam", device=path, **config))
 
 
 @pytest.fixture
-def controls(quick: None, monkeypatch: pytest.MonkeyPatch) -> type[Controls]:
-    monkeypatch.setattr(webcam.cv2, "VideoCapture", Controls)
-    for name in ("autofocus_stays", "automatic_stays", "gone"):
-        monkeypatch.setattr(Controls, name, None)
-    return Controls
+def controls(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
+    has = {
+        cv2.CAP_PROP_FOCUS: 30.0,
+        cv2.CAP_PROP_AUTOFOCUS: 1.0,
+        cv2.CAP_PROP_AUTO_EXPOSURE: 3.0,
+        cv2.CAP_PROP_EXPOSURE: 50.0,
+    }
+    monkeypatch.setattr(Film, "controls", has)
+    return has
 
 
-@pytest.mark.parametrize("pixel_format", ["Mono8", "BGR8"])
-async def test_a_sequence_of_images_comes_as_opencv_reads_it(
-    quick: None, pictures: str, pixel_format: str
+@pytest.mark.parametrize(
+    ("pixel_format", "shape"), [("Mono8", SIZE[::-1]), ("BGR8", (*SIZE[::-1], 3))], ids=str
+)
+async def test_an_image_comes_in_the_format_asked_for(
+    camera: Webcam, pixel_format: str, shape: tuple[int, ...]
 ) -> None:
-    camera = WebcamCamera(CameraConfig(driver="webcam", device=pictures, pixel_format=pixel_format))
-    await camera.open()
-    image = await camera.capture()
-    assert image.pixel_format == pixel_format and image.frame_id is None
-    assert image.pixels.shape == (SIZE if pixel_format == "Mono8" else (*SIZE, 3))
-    assert len(np.unique(image.pixels)) == 1
-    await camera.close()
+    made = camera(pixel_format=pixel_format)
+    await made.open()
+    image = await made.capture()
+    assert (image.pixel_format, image.pixels.shape, image.frame_id) == (pixel_format, shape, None)
+    await made.close()
 
 
-async def test_its_time_is_known_by_arrival_and_too_poor_for_the_usual_limit(pictures: str) -> None:
-    camera = WebcamCamera(CameraConfig(driver="webcam", device=pictures))
-    assert camera.timing is None
-    await camera.open()
-    assert camera.timing is not None and camera.timing.source == "arrival"
-    assert camera.timing.bound_s == 0.1 > CaptureConfig().time_bound_s
-    await camera.close()
+async def test_its_time_is_known_by_arrival_and_too_poor_for_the_usual_limit(
+    camera: Webcam, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    made = camera()
+    assert made.timing is None
+    await made.open()
+    assert made.timing is not None and made.timing.source == "arrival"
+    assert made.timing.bound_s == 0.1 > CaptureConfig().time_bound_s
+    await made.close()
 
 
-async def test_exposure_is_set_and_focus_held(controls: type[Controls], pictures: str) -> None:
-    camera = WebcamCamera(CameraConfig(driver="webcam", device=pictures, exposure_us=8000.0))
-    await camera.open()
-    assert controls.values[cv2.CAP_PROP_AUTOFOCUS] == 0
-    settings = await camera.settings()
+async def test_exposure_is_set_and_focus_held(camera: Webcam, controls: dict[int, float]) -> None:
+    made = camera(exposure_us=8000.0)
+    await made.open()
+    assert controls[cv2.CAP_PROP_AUTOFOCUS] == 0
+    settings = await made.settings()
     assert (settings["exposure_us"], settings["focus"]) == (8000.0, 30.0)
-    assert (await camera.capture()).exposure_us == 8000.0
-    controls.values[cv2.CAP_PROP_FOCUS] = 35.0
+    assert (await made.capture()).exposure_us == 8000.0
+    controls[cv2.CAP_PROP_FOCUS] = 35.0
     for _ in range(2):
         with raises("settings-changed"):
-            await camera.capture()
-    await camera.close()
-    await camera.open()
-    assert (await camera.settings())["focus"] == 30.0, "the lens of the pictures before"
-    await camera.close()
+            await made.capture()
+    await made.close()
+    await made.open()
+    assert (await made.settings())["focus"] == 30.0, "the lens of the pictures before"
+    await made.close()
 
 
 @pytest.mark.parametrize("mode", [0.0, 3.0])
 async def test_an_exposure_that_stays_automatic_is_not_told_as_one(
-    controls: type[Controls], pictures: str, mode: float
+    camera: Webcam, controls: dict[int, float], monkeypatch: pytest.MonkeyPatch, mode: float
 ) -> None:
     """V4L2 has three automatic modes, 0 among them; what the camera tells of its exposure is of a moment."""
-    controls.automatic_stays = mode
-    camera = WebcamCamera(CameraConfig(driver="webcam", device=pictures))
-    await camera.open()
-    assert (await camera.capture()).exposure_us == 0.0
-    assert "exposure_us" not in await camera.settings()
-    await camera.close()
+    monkeypatch.setattr(Film, "stay", {cv2.CAP_PROP_AUTO_EXPOSURE})
+    controls[cv2.CAP_PROP_AUTO_EXPOSURE] = mode
+    made = camera()
+    await made.open()
+    assert (await made.capture()).exposure_us == 0.0
+    assert "exposure_us" not in await made.settings()
+    await made.close()
 
 
-async def test_an_autofocus_that_stays_on_is_refused(controls: type[Controls], pictures: str) -> None:
-    controls.autofocus_stays = True
+async def test_an_autofocus_that_stays_on_is_refused(
+    camera: Webcam, controls: dict[int, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Film, "stay", {cv2.CAP_PROP_AUTOFOCUS})
     with raises("autofocus"):
-        await WebcamCamera(CameraConfig(driver="webcam", device=pictures)).open()
+        await camera().open()
 
 
 @pytest.mark.parametrize(
     ("region", "code"), [((0, 0, 800, 600), "webcam-size"), ((8, 0, 320, 240), "webcam-region")]
 )
-async def test_a_size_that_it_has_not_is_refused(
-    pictures: str, region: tuple[int, int, int, int], code: str
-) -> None:
+async def test_a_size_that_it_has_not_is_refused(camera: Webcam, region: Any, code: str) -> None:
     with raises(code):
-        await WebcamCamera(CameraConfig(driver="webcam", device=pictures, region=region)).open()
+        await camera(region=region).open()
 
 
-async def test_a_webcam_that_is_gone_is_opened_again(controls: type[Controls], pictures: str) -> None:
-    camera = WebcamCamera(CameraConfig(driver="webcam", device=pictures))
-    await camera.open()
-    await camera.capture()
-    controls.gone = True
-    with raises("camera-gone"):
-        await camera.capture()
-    controls.gone = False
-    await camera.capture()
-    assert (camera.counts().frames, camera.counts().missing) == (2, 1)
-    await camera.close()
+async def test_a_webcam_that_is_gone_is_opened_again(camera: Webcam, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = camera()
+    await made.open()
+    await made.capture()
+    with monkeypatch.context() as now:
+        now.setattr(Film, "gone", True)
+        with raises("camera-gone"):
+            await made.capture()
+    await made.capture()
+    assert (made.counts().frames, made.counts().missing) == (2, 1)
+    await made.close()
 
 
 async def test_no_webcam_at_all() -> None:

@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import pytest
 
-from station.cell.config import CameraConfig, CaptureConfig
+from station.cell.config import CameraConfig
+from station.cell.status import FrameTiming
 from station.devices import webcam
 from station.devices.webcam import WebcamCamera, discover_webcams
 from tests.codes import raises
@@ -40,25 +41,15 @@ def controls(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
 @pytest.mark.parametrize(
     ("pixel_format", "shape"), [("Mono8", SIZE[::-1]), ("BGR8", (*SIZE[::-1], 3))], ids=str
 )
-async def test_an_image_comes_in_the_format_asked_for(
+async def test_an_image_comes_in_the_format_asked_for_its_time_known_by_arrival(
     camera: Webcam, pixel_format: str, shape: tuple[int, ...]
 ) -> None:
     made = camera(pixel_format=pixel_format)
-    await made.open()
-    image = await made.capture()
-    assert (image.pixel_format, image.pixels.shape, image.frame_id) == (pixel_format, shape, None)
-    await made.close()
-
-
-async def test_its_time_is_known_by_arrival_and_too_poor_for_the_usual_limit(
-    camera: Webcam, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.undo()
-    made = camera()
     assert made.timing is None
     await made.open()
-    assert made.timing is not None and made.timing.source == "arrival"
-    assert made.timing.bound_s == 0.1 > CaptureConfig().time_bound_s
+    assert made.timing == FrameTiming("arrival", webcam.LATENCY_S / 2)
+    image = await made.capture()
+    assert (image.pixel_format, image.pixels.shape, image.frame_id) == (pixel_format, shape, None)
     await made.close()
 
 

@@ -45,7 +45,9 @@ class FrameCounter:
         last_id, last_pulse = self._last_id, self._last_pulse
         self._last_id, self._last_pulse = frame_id, pulse_count
         frames = frames_between(last_id, frame_id)
-        pulses = 1 if last_pulse is None or pulse_count is None else pulse_count - last_pulse
+        pulses = 1
+        if last_pulse is not None and pulse_count is not None and pulse_count >= last_pulse:
+            pulses = pulse_count - last_pulse  # a box that was lost and opened again counts from its restart
         if frames is None:
             raise CameraError("frame-ids-restarted", frame=frame_id, after=last_id)
         if frames == 0:

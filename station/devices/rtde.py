@@ -257,7 +257,4 @@ def _recipe(answer: bytes, names: Sequence[str]) -> Recipe:
     types = split_names(answer[1:])
     if len(types) != len(names):
         raise RtdeError(reason=f"the controller answered {len(types)} types for {len(names)} variables")
-    refused = [n for n, t in zip(names, types, strict=True) if t == NOT_FOUND]
-    if refused:
-        raise RtdeError("rtde-variables", names=", ".join(refused))
     return Recipe(answer[0], tuple(names), types)

@@ -104,7 +104,9 @@ class SerialTrigger:
         return f"{product} {serial}"
 
     def _fire(self) -> TriggerPulse:
-        if self._port is None and self._opened:
+        if not self._opened:
+            raise TriggerError("trigger-not-open")
+        if self._port is None:
             self._connect()  # it was lost; counting restarts
         asked_ns = time.monotonic_ns()
         try:
@@ -137,7 +139,7 @@ class SerialTrigger:
 
     def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
         """Send a request; return the first fields of its answer. Other lines are skipped."""
-        port = self._require_port()
+        port = self._port
         end_s = time.monotonic() + timeout_s
         try:
             port.reset_input_buffer()
@@ -152,11 +154,6 @@ class SerialTrigger:
             self._disconnect()
             raise TriggerError("trigger-lost", port=self._config.port, reason=str(error)) from error
         raise _BoxSilentError(request=request, limit_s=timeout_s)
-
-    def _require_port(self) -> Any:
-        if self._port is None:
-            raise TriggerError("trigger-not-open")
-        return self._port
 
     def _disconnect(self) -> None:
         port, self._port = self._port, None

@@ -151,6 +151,9 @@ def test_after_a_loss_any_number_may_be_the_next_and_the_pulses_go_on_from_there
     counter.lost(pulse_count=11)
     counter.accept(7, pulse_count=12)
     assert counter.counts() == CameraCounts(frames=2, missing=1, paired=2)
+    counter.accept(8, pulse_count=1)  # the box was lost and opened again
+    with raises("pulse-count"):
+        counter.accept(9, pulse_count=3)
 
 
 def test_18_a_gap_in_the_frame_ids_is_an_error_even_where_a_picture_came() -> None:

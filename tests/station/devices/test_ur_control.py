@@ -14,6 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import pytest
 
@@ -29,40 +30,10 @@ from tests.patience import PATIENCE_S
 GOAL = [0.0, -1.5, 1.5, -1.5, -1.5, 0.0]
 
 
-class Library:
-    """Notes what it was asked; `deaf`: these calls fail."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[str, Any]] = []
-        self.deaf: set[str] = set()
-
-    def _note(self, name: str, *arguments: Any) -> bool:
-        self.calls.append((name, arguments))
-        return name not in self.deaf
-
-    def setWatchdog(self, minimum_hz: float) -> bool:
-        return self._note("setWatchdog", minimum_hz)
-
-    def kickWatchdog(self) -> bool:
-        return self._note("kickWatchdog")
-
-    def moveJ(self, q: list[float], speed: float, acceleration: float, asynchronous: bool) -> bool:
-        return self._note("moveJ", asynchronous)
-
-    def stopJ(self, deceleration: float, asynchronous: bool) -> None:
-        self._note("stopJ", asynchronous)
-
-    def stopScript(self) -> None:
-        self._note("stopScript")
-
-    @property
-    def names(self) -> list[str]:
-        return [name for name, _ in self.calls]
-
-
 class Conversation:
     def __init__(self) -> None:
-        self.library = Library()
+        self.library = Mock()
+        """In place of the library: every call succeeds"""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.settimeout(1.0)
         self.ours = ours
@@ -81,6 +52,10 @@ class Conversation:
                 answers.append(json.loads(self.ours.recv(4096)))
         except BlockingIOError:
             return answers
+
+    @property
+    def calls(self) -> list[str]:
+        return [name for name, *_ in self.library.method_calls]
 
     def close(self) -> None:
         self.ours.close()
@@ -104,23 +79,23 @@ def move(joints: list[float] | None = None) -> dict[str, Any]:
 
 def test_a_fresh_beat_arms_the_watchdog_once_and_kicks_it_each_time(child: Conversation) -> None:
     answers = child.say(beat(), beat(), beat())
-    assert child.library.calls[0] == ("setWatchdog", (WATCHDOG_HZ,))
-    assert child.library.names == ["setWatchdog", *["kickWatchdog"] * 3, "stopScript"]
+    assert child.library.method_calls[0] == call.setWatchdog(WATCHDOG_HZ)
+    assert child.calls == ["setWatchdog", *["kickWatchdog"] * 3, "stopScript"]
     assert [(a["kicked"], a["lost"]) for a in answers] == [(True, False)] * 3
 
 
 def test_a_beat_that_waited_too_long_kicks_nothing(child: Conversation) -> None:
     answers = child.say(beat(age_ns=BEAT_FRESH_NS + 1_000_000))
-    assert child.library.names == ["stopScript"]
+    assert child.calls == ["stopScript"]
     assert not answers[0]["kicked"] and not answers[0]["lost"]
 
 
 def test_a_script_that_took_no_kick_is_never_kicked_again(child: Conversation) -> None:
-    child.library.deaf = {"kickWatchdog"}
+    child.library.kickWatchdog.return_value = False
     answers = child.say(beat(), beat(), move())
-    assert child.library.names.count("kickWatchdog") == 1
+    assert child.calls.count("kickWatchdog") == 1
     assert [(a["kicked"], a["lost"]) for a in answers[:2]] == [(False, True)] * 2
-    assert answers[2]["moved"] and "moveJ" not in child.library.names
+    assert answers[2]["moved"] and "moveJ" not in child.calls
 
 
 def test_a_move_that_only_a_late_heartbeat_refuses_tells_how_late(child: Conversation) -> None:
@@ -136,40 +111,40 @@ FRESH = beat(age_ns=-3600 * 10**9)
 
 
 @pytest.mark.parametrize(
-    ("deaf", "before", "joints"),
+    ("armed", "before", "joints"),
     [
-        (set(), [], GOAL),
-        (set(), [beat(age_ns=10 * BEAT_FRESH_NS)], GOAL),
-        ({"setWatchdog"}, [FRESH], GOAL),
-        (set(), [FRESH, STOP, FRESH], GOAL),
+        (True, [], GOAL),
+        (True, [beat(age_ns=10 * BEAT_FRESH_NS)], GOAL),
+        (False, [FRESH], GOAL),
+        (True, [FRESH, STOP, FRESH], GOAL),
         *(
-            (set(), [FRESH], joints)
+            (True, [FRESH], joints)
             for joints in ([0.0] * 5, [0.0] * 7, [math.nan, *[0.0] * 5], [math.inf] * 6)
         ),
     ],
     ids=["no heartbeat", "an old heartbeat", "no watchdog", "after a stop", "5", "7", "nan", "inf"],
 )
 def test_nothing_moves(
-    child: Conversation, deaf: set[str], before: list[dict[str, Any]], joints: list[float]
+    child: Conversation, armed: bool, before: list[dict[str, Any]], joints: list[float]
 ) -> None:
-    child.library.deaf = deaf
+    child.library.setWatchdog.return_value = armed
     answer = child.say(*before, move(joints))[-1]
-    assert answer["moved"] and "moveJ" not in child.library.names
+    assert answer["moved"] and "moveJ" not in child.calls
 
 
 def test_the_watchdog_is_armed_before_every_move_and_moves_are_asynchronous(child: Conversation) -> None:
     answers = child.say(beat(), move(), move())
     assert [answer["moved"] for answer in answers[1:]] == ["", ""]
-    names = child.library.names
-    assert [names[i - 1] for i, name in enumerate(names) if name == "moveJ"] == ["setWatchdog"] * 2
-    assert ("moveJ", (True,)) in child.library.calls
+    calls = child.calls
+    assert [calls[i - 1] for i, name in enumerate(calls) if name == "moveJ"] == ["setWatchdog"] * 2
+    assert call.moveJ(GOAL, 0.5, 1.0, True) in child.library.method_calls
 
 
 def test_a_stop_is_the_one_that_the_librarys_script_takes_for_a_stop_of_the_joints(
     child: Conversation,
 ) -> None:
     assert child.say(STOP) == [{"stopped": True}]
-    assert child.library.calls[0] == ("stopJ", (False,))
+    assert child.library.method_calls[0] == call.stopJ(4.0, False)
 
 
 # -- the parent's side, with the real library -----------------------------------------------------------

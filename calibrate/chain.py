@@ -170,28 +170,34 @@ _EXACT_RAD = 1e-4
 """Rms difference of rotations at which no other start is tried: less than joints rounded to 1e-4 leave."""
 
 
+_ENOUGH = 60
+"""Most pairs that are learned from, evenly spread: 15 hold a whole chain. All are asked whether it fits."""
+
+
 def learn_chain(joints_rad: Array, flanges: Array, starts: int | None = None) -> LearnedChain:
     """Learn a chain from joints (m, n) and base_from_flange (m, 4, 4).
 
     The postures of the first `starts` views (None: all) are tried in turn, until one explains all rotations.
     """
+    some = np.unique(np.linspace(0, len(flanges) - 1, min(len(flanges), _ENOUGH)).astype(np.intp))
+    joints, told = joints_rad[some], flanges[some]
     best, least, at = np.zeros(0), np.inf, 0
-    for place in range(len(flanges))[:starts]:
-        found, rms = _fit_rotations(joints_rad, flanges[:, :3, :3], place)
+    for place in range(len(some))[:starts]:
+        found, rms = _fit_rotations(joints, told[:, :3, :3], place)
         if rms < least:
             best, least, at = found, rms, place
         if least < _EXACT_RAD:
             break
-    axes, lead, away = best[:-1], best[-1], joints_rad - joints_rad[at]
+    axes, lead, away = best[:-1], best[-1], joints - joints[at]
     # Position of the flange = Σ P_j (1 - E_j) point_j + P_n t: linear in the points and t. Along an axis a
     # point is free; the shortest solution takes it.
     fixed = np.eye(3) - rotation_exp(axes * away[..., None])
     products = _products(axes, away)
     rows = np.concatenate([products[:, :-1] @ fixed, products[:, -1:]], axis=1)
     rows = rows.transpose(0, 2, 1, 3).reshape(3 * len(away), -1)
-    found = np.linalg.lstsq(rows, flanges[:, :3, 3].ravel(), rcond=1e-9)[0].reshape(-1, 3)
-    flange = pose(rotation_exp(lead) @ flanges[at, :3, :3], found[-1])
-    chain = Chain(axes, found[:-1], joints_rad[at], flange)
+    found = np.linalg.lstsq(rows, told[:, :3, 3].ravel(), rcond=1e-9)[0].reshape(-1, 3)
+    flange = pose(rotation_exp(lead) @ told[at, :3, :3], found[-1])
+    chain = Chain(axes, found[:-1], joints[at], flange)
     return LearnedChain(chain, difference(chain.forward(joints_rad), flanges))
 
 
@@ -226,9 +232,9 @@ def read_otherwise(joints_rad: Array, flanges: Array) -> tuple[Array, str] | Non
     return None
 
 
-def wrong_row(joints_rad: Array, flanges: Array) -> int | None:
-    """Find the one pair without which the others explain each other."""
-    for place in range(len(flanges)):
+def wrong_row(learned: LearnedChain, joints_rad: Array, flanges: Array) -> int | None:
+    """Find the one pair without which the others explain each other, among those that fit `learned` worst."""
+    for place in np.argsort(-(learned.miss**2).sum(axis=1))[:_ENOUGH].tolist():
         others = np.arange(len(flanges)) != place
         if learn_chain(joints_rad[others], flanges[others], _QUICK).explains:
             return place

@@ -69,7 +69,7 @@ def _learned(joints: Array, views: ViewSet) -> tuple[LearnedChain, Array, str]:
         return learn_chain(read[0], flanges), read[0], f"The recorded joints fit the poses {read[1]}."
     shift, turn = learned.rms
     note = f"The recorded joints do not explain the poses ({1e3 * shift:.1f} mm, {np.degrees(turn):.1f}°). "
-    row = wrong_row(joints, flanges)
+    row = wrong_row(learned, joints, flanges)
     if row is None:
         return learned, joints, note + "Check the order and unit of the joints."
     return learned, joints, note + f"Without pose {views.views[row].index + 1} they do: look at its joints."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -96,8 +97,19 @@ def test_one_wrong_pair_is_found() -> None:
     joints = arm.postures(rng, 15)
     flanges = arm.forward(joints)
     joints[3] = joints[4]
-    assert not learn_chain(joints, flanges).explains and read_otherwise(joints, flanges) is None
-    assert wrong_row(joints, flanges) == 3
+    learned = learn_chain(joints, flanges)
+    assert not learned.explains and read_otherwise(joints, flanges) is None
+    assert wrong_row(learned, joints, flanges) == 3
+
+
+def test_thousands_of_views_are_learned_from_in_bounded_time() -> None:
+    arm, start = DhArm("ur"), time.process_time()
+    joints = arm.postures(np.random.default_rng(8), 3000)
+    flanges = arm.forward(joints)
+    assert learn_chain(joints, flanges).rms[0] < 1e-9
+    learned = learn_chain(joints, flanges[::-1])
+    assert not learned.explains and wrong_row(learned, joints, flanges[::-1]) is None
+    assert time.process_time() - start < 20
 
 
 def test_a_linear_axis_is_refused_and_a_bending_arm_is_taken_with_what_is_left() -> None:

@@ -41,7 +41,7 @@ def in_front(H: Array, X: Array, rng: np.random.Generator) -> ViewSet:
 @MOUNTS
 def test_the_blogs_equations_hold_through_the_same_code_for_both_mounts(mount):
     X = pose(rotation_exp([0, np.radians(-15), 0]), [0.1, 0, 0])
-    cell = make_cell(np.random.default_rng(0), 12, LOW, scene="blog", mount=mount, X=X)
+    cell = make_cell(np.random.default_rng(0), 12, LOW, mount=mount, X=X)
     solution = solve_views(cell.views)
     assert error_mm_deg(solution.matrix, X)[0] < 0.3
     assert error_mm_deg(solution.matrix, X)[1] < 0.05

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from benchmarks.scene import random_rotation
 from calibrate.geometry import inverse, pose
@@ -26,15 +27,6 @@ def test_pairs_follow_the_published_equations_for_each_mount(mount):
         np.testing.assert_allclose(pairs.B[n], C[n + 1] @ np.linalg.inv(C[n]), atol=1e-12)
 
 
-def test_thousands_of_views_give_a_bounded_number_of_pairs_that_reaches_every_view():
-    rng = np.random.default_rng(2)
-    H, C = exact_motions(rng, 3000, pose(random_rotation(rng), rng.normal(size=3)))
-    pairs = all_pairs(H, C)
-    assert len(pairs) <= 20_000
-    assert set(pairs.first) | set(pairs.second) == set(range(3000))
-    assert (pairs.first < pairs.second).all()
-
-
 def test_screw_invariants_do_not_depend_on_the_camera():
     rng = np.random.default_rng(3)
     X = pose(random_rotation(rng), rng.normal(size=3))
@@ -47,9 +39,10 @@ def test_screw_invariants_do_not_depend_on_the_camera():
     np.testing.assert_allclose(along, again_along, atol=1e-6)
 
 
-def test_above_the_limit_pairs_still_reach_across_the_session():
-    n = MAX_PAIRS // 2 + 1
+@pytest.mark.parametrize("n", [3000, MAX_PAIRS // 2 + 1])
+def test_above_the_limit_pairs_are_few_and_still_reach_across_the_session(n):
     H = np.broadcast_to(np.eye(4), (n, 4, 4))
     pairs = all_pairs(H, H)
+    assert set(pairs.first) | set(pairs.second) == set(range(n)) and (pairs.first < pairs.second).all()
     apart = pairs.second - pairs.first
-    assert len(pairs) <= 3 * n and ((apart > n // 5) & (apart < 4 * n // 5)).sum() >= n
+    assert len(pairs) <= max(MAX_PAIRS, 3 * n) and ((apart > n // 5) & (apart < 4 * n // 5)).sum() >= n

@@ -234,7 +234,7 @@ def read_otherwise(joints_rad: Array, flanges: Array) -> tuple[Array, str] | Non
 
 def wrong_row(learned: LearnedChain, joints_rad: Array, flanges: Array) -> int | None:
     """Find the one pair without which the others explain each other, among those that fit `learned` worst."""
-    for place in np.argsort(-(learned.miss**2).sum(axis=1))[:_ENOUGH].tolist():
+    for place in map(int, np.argsort(-(learned.miss**2).sum(axis=1))[:_ENOUGH]):
         others = np.arange(len(flanges)) != place
         if learn_chain(joints_rad[others], flanges[others], _QUICK).explains:
             return place

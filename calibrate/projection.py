@@ -106,9 +106,7 @@ def intrinsics_names(camera: CameraModel) -> tuple[str, ...]:
 def intrinsics_vector(camera: CameraModel) -> Array:
     """Return (p,) in the order of `intrinsics_names`: pixels for the first four, the others plain."""
     K = camera_matrix(camera)
-    distortion = np.zeros(len(intrinsics_names(camera)) - 4)
-    distortion[: len(camera.distortion)] = camera.distortion[: len(distortion)]
-    return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], distortion])
+    return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], distortion(camera)])
 
 
 def with_intrinsics_vector(camera: CameraModel, vector: Array) -> CameraModel:
@@ -191,8 +189,7 @@ _UNDISTORT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-1
 
 def distortion(camera: CameraModel) -> Array:
     """Return OpenCV's coefficients: (4,) for equidistant, otherwise (5,) or (8,), zeros appended."""
-    values = np.array(camera.distortion, dtype=float)
-    size = 4 if camera.distortion_model == "equidistant" else (8 if len(values) > 5 else 5)
+    values, size = np.array(camera.distortion, dtype=float), len(intrinsics_names(camera)) - 4
     if len(values) > size or not np.isfinite(values).all():
         raise BadViewsError(
             "distortion", distortion=str(camera.distortion), model=camera.distortion_model, size=size

@@ -47,12 +47,7 @@ def _judge(fit: CellFit, places: slice, miss: Array, sigma: Array, distance_m: f
     values, vectors = np.linalg.eigh((left + left.T) / 2)
     told = values > 1e-3
     square = float(((vectors.T @ (miss * root))[told] ** 2 / values[told]).sum())
-    with np.errstate(divide="ignore"):
-        log_chance = float(np.log(special.chdtrc(max(int(told.sum()), 1), square)))
-    if log_chance < -600:
-        sigmas = float(np.sqrt(-2 * log_chance))
-    else:
-        sigmas = -float(special.ndtri(np.exp(log_chance) / 2))
+    sigmas = -float(special.ndtri(special.chdtrc(max(int(told.sum()), 1), square) / 2))
     precision = np.zeros(len(covariance))
     precision[places] = (1 - _LOOSER) * sigma**-2.0
     step = np.zeros(len(covariance))

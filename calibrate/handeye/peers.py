@@ -9,6 +9,7 @@ from functools import partial
 
 import cv2
 import numpy as np
+from scipy import optimize
 
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, is_rigid, perturb, rotation_log
@@ -27,7 +28,6 @@ from calibrate.handeye.axxb.peer_methods import (
 )
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import estimate
-from calibrate.handeye.linear import MAX_STEPS
 from calibrate.handeye.metrics import (
     FEWEST_FITTED,
     HELD_OUT,
@@ -39,7 +39,7 @@ from calibrate.handeye.metrics import (
 )
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
-from calibrate.handeye.reprojection import corner_residuals, linearise_corners
+from calibrate.handeye.reprojection import corner_residuals
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_robust_profile
 from calibrate.projection import intrinsics_vector
@@ -180,21 +180,14 @@ def reprojection_px(views: ViewSet, X: Array) -> float | None:
     observed = observe_views(views)
     if not observed.has_pixels:
         return None
-    H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
+    H, C = _pose_arrays(views)
     camera_from_place = inverse(H @ X)
     Y = mean_pose(H @ X @ C)
-    best = np.inf
-    for _ in range(MAX_STEPS):
-        C = camera_from_place @ Y
-        square = float((corner_residuals(observed, views.camera, C) ** 2).sum())
-        if not np.isfinite(square) or square >= best * (1 - 1e-9):
-            break
-        best = square
-        blocks = linearise_corners(observed, views.camera, C, observed.present)
-        T = np.zeros((len(H), 6, 6))
-        T[:, :3, :3] = T[:, 3:, 3:] = camera_from_place[:, :3, :3]
-        T_t = np.swapaxes(T, 1, 2)
-        N = (T_t @ blocks.LL @ T).sum(axis=0)
-        g = (T_t @ blocks.Lr[..., None]).sum(axis=0)[:, 0]
-        Y = perturb(Y, np.linalg.lstsq(N, g, rcond=None)[0])
-    return float(np.sqrt(best / observed.present.sum()))
+
+    def off(delta: Array) -> Array:
+        return corner_residuals(observed, views.camera, camera_from_place @ perturb(Y, delta)).ravel()
+
+    if not np.isfinite(off(np.zeros(6))).all():
+        return np.inf
+    fit = optimize.least_squares(off, np.zeros(6), x_scale="jac")
+    return float(np.sqrt(2 * fit.cost / observed.present.sum()))

@@ -59,20 +59,7 @@ def evolve(
 
 
 def _partners(rng: np.random.Generator, generations: int, population: int) -> NDArray[np.intp]:
-    """Draw p1 ≠ p2 ≠ p3 ≠ i uniformly, (generations, 3, population).
-
-    Each is drawn from as many numbers as are free, then raised past those already taken.
-    """
-    shape = (generations, population)
-    own = np.broadcast_to(np.arange(population), shape)
-    p1 = rng.integers(0, population - 1, size=shape)
-    p1 += p1 >= own
-    low, high = np.minimum(own, p1), np.maximum(own, p1)
-    p2 = rng.integers(0, population - 2, size=shape)
-    p2 += p2 >= low
-    p2 += p2 >= high
-    p3 = rng.integers(0, population - 3, size=shape)
-    lowest, highest = np.minimum(low, p2), np.maximum(high, p2)
-    for taken in (lowest, low + high + p2 - lowest - highest, highest):
-        p3 += p3 >= taken
-    return np.stack([p1, p2, p3], axis=1)
+    """Draw p1 ≠ p2 ≠ p3 ≠ i uniformly, (generations, 3, population)."""
+    keys = rng.random((generations, population, population))
+    keys[:, range(population), range(population)] = np.inf
+    return np.argsort(keys, axis=2)[..., :3].transpose(0, 2, 1)

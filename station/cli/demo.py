@@ -98,7 +98,7 @@ def demo_command(
     with own_daemon(served, folder / "daemon.log") as socket:
         outcome = asyncio.run(_captured(socket, plan, quiet))
     if outcome.session.recording and not quiet:
-        err.print("Solving: some ten seconds …", style="dim")
+        err.print("Solving …", style="dim")
     solved, made = _solved(outcome), Path(outcome.session.folder)
     arm = solved.arm_table
     # The camera's true pose is that on the true arm: the X of the corrected one is to be compared with it.

@@ -91,7 +91,7 @@ class StationApp(LivePageApp[None], DaemonApp):
             )
             for s in SCREENS
         ),
-        Binding("ctrl+q", "leave", "Quit", show=False, tooltip="Close this screen; the daemon goes on"),
+        Binding("ctrl+q", "quit", "Quit", show=False, tooltip="Close this screen; the daemon goes on"),
     ]
 
     def __init__(self, client: Client) -> None:
@@ -177,19 +177,20 @@ class StationApp(LivePageApp[None], DaemonApp):
             asked = self._look.is_set()
             self._look.clear()
             if self.known.live is not None and (asked or not self.known.works):
-                await self._read_changed(self.known.live.session)
+                await self.link.attempt(self._read_changed(self.known.live.session))
 
     async def _read_changed(self, session: SessionStatus) -> None:
         client, path = self.link.client, self.result_path
-        if not path and session.recording and client.root is not None:
+        if not path and client.root is not None:
             path = await asyncio.to_thread(solved_file, session, client.root, client.camera)
         root = state_root(path) if path else client.root
         if root is None or (found := (path, await asyncio.to_thread(marks, root))) == self._marks:
             return
+        self._marks = found
         result = await asyncio.to_thread(read_result, path) if path else None
         self.known = replace(self.known, result=result)
         kept = await asyncio.to_thread(read_sessions, client.root or root, client.camera)
-        self.known, self._marks = replace(self.known, sessions=kept), found
+        self.known = replace(self.known, sessions=kept)
 
     # --- what the screens ask for by a key ---
 
@@ -267,7 +268,7 @@ class StationApp(LivePageApp[None], DaemonApp):
             self.clear_notifications()  # what they said of the stop is over
 
     @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_leave(self) -> None:
+    async def action_quit(self) -> None:  # type: ignore[override]  # Textual awaits a worker, too
         held = self.known.works and self.link.has_control()
         if not held or await self.link.ask_person(Confirm("Close the screen?", HELD, yes="Close")):
             self.exit()
@@ -278,8 +279,11 @@ class StationApp(LivePageApp[None], DaemonApp):
         return shown.upper() if shown[0] == "f" and shown[1:].isdigit() else shown
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """List every key's action by name; what moves the arm asks first from here too."""
-        yield from super().get_system_commands(screen)
+        """List every key's action by name; what moves the arm asks first from here too.
+
+        Of Textual's own only the theme: its others hide the frame, with STOP, or quit unasked.
+        """
+        yield SystemCommand("Theme", "Dark, light, or the terminal's own colours", self.action_change_theme)
         own = screen.BINDINGS if isinstance(screen, StationScreen) else []
         for place, bindings in ((screen, own), (self, self.BINDINGS)):
             for binding in (b for b in bindings if isinstance(b, Binding) and b.tooltip):

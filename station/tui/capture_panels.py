@@ -30,7 +30,7 @@ def quality_line(seen: DetectionStatus) -> Content:
     if seen.tilt_rad is not None:
         parts.append(facts(("tilt", f"{math.degrees(seen.tilt_rad):.0f}°", "")))
     if seen.distance_m is not None:
-        parts.append(facts(("at", f"{1000 * seen.distance_m:.0f} mm", "")))
+        parts.append(facts(("", f"{1000 * seen.distance_m:.0f} mm", "")))
     parts.append(facts(("fills", f"{100 * seen.coverage:.0f} %", "")))
     line = Content("  ").join(parts)
     return line + Content.styled(f"   {seen.advice}", "$warn") if seen.advice else line

@@ -24,8 +24,8 @@ from station.tui.widgets.cell_drawing import cell_scene, draw
 from station.tui.words import duration, hanging, limit_bar, lines
 
 TERMINATE_S = 5.0
-WIDTH, INDENT = 64, 10
-"""Width of a fact with its name before it, and of the name, in letters."""
+WIDTH, INDENT, ROUND_IT = 64, 10, 6
+"""Width of a fact with its name before it, of the name, and of the window's frame, in letters."""
 
 
 class Confirm(Question[bool]):
@@ -69,7 +69,7 @@ class ConfirmMotion(Confirm):
 
     def body(self) -> ComposeResult:
         with Horizontal(id="motion-facts"):
-            yield Static(motion_text(self._preview), id="confirm-body")
+            yield Static(motion_text(self._preview, self.app.size.width - ROUND_IT), id="confirm-body")
             yield Static(id="motion-scene")
         yield Static(id="motion-holds")
         yield from self.buttons()
@@ -102,12 +102,12 @@ class ConfirmMotion(Confirm):
             self.dismiss(False)
 
 
-def motion_text(preview: MotionPreview) -> Content:
-    """List the facts of a motion, one a line."""
+def motion_text(preview: MotionPreview, room: int) -> Content:
+    """List the facts of a motion, one a line, in `room` letters at most."""
     rows = []
     for name, text in motion_facts(preview):
         style = "bold $warn" if name == "WARNING" else "$foreground"
-        told = hanging(text, WIDTH, INDENT)
+        told = hanging(text, min(WIDTH, room), INDENT)
         rows.append(Content.assemble((f"{name:<{INDENT}}", "$dim"), (told, style)))
     device = "The emergency stop on the pendant is the safety device. F12 stops too."
     return lines(*rows, Content(""), Content(device))

@@ -226,6 +226,7 @@ ASKS: dict[str, type[Verb[Any]]] = {
     "finish": verbs.Finish,
     "acknowledge": verbs.Acknowledge,
     "freedrive": verbs.Freedrive,
+    "make": verbs.MakePlan,
     "ask('record')": verbs.Record,
     "take_back": verbs.Record,
     "act('touch test')": verbs.Observe,
@@ -239,7 +240,8 @@ NEEDS: dict[str, Callable[[Known], object]] = {
     "app.drift_check": lambda n: n.result.state.now if n.result else any(k.word for k in n.sessions or ()),
     **dict.fromkeys(("report", "act('touch test')"), lambda now: now.result),
     **dict.fromkeys(("pose('retake')", "pose('skip')"), lambda now: now.shown.session.poses),
-    **dict.fromkeys(("act('solve')", "act('check')", "act('recover')"), lambda now: now.sessions),
+    **dict.fromkeys(("act('solve')", "act('check')"), lambda now: now.sessions),
+    "act('recover')": lambda now: not all(kept.session.sealed for kept in now.sessions or ()),
 }
 """What the action of a key works on; it has none while that is empty."""
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]

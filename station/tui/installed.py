@@ -37,6 +37,8 @@ class Installed:
     """Other solves that were installed before."""
     drift: tuple[CheckEntry, ...] = ()
     """Drift checks of `now`, oldest first."""
+    checks: tuple[CheckEntry, ...] = ()
+    """Drift checks of every version, oldest first."""
     log: tuple[LogEntry, ...] = ()
     """Every installation, oldest first."""
 
@@ -69,17 +71,17 @@ class Installed:
 def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
     """Read all of one camera, in a thread: many files take a moment."""
     folder = calibrations_folder(root, camera)
-    now, validity, log = None, None, list[LogEntry]()
-    with suppress(CalibrationError):
-        number, path = current_version(folder)  # one version, whatever is installed meanwhile
-        now, validity = read_calibration(path), validity_of(folder, number)
+    now, validity, log, checks = None, None, list[LogEntry](), list[CheckEntry]()
     with suppress(CalibrationError, OSError):
-        log = read_log(root, camera)
+        number, path = current_version(folder)  # one version, whatever is installed meanwhile
+        now, validity = _read_at(path, path.stat().st_mtime_ns), validity_of(folder, number)
+    with suppress(CalibrationError, OSError):
+        log, checks = read_log(root, camera), read_checks(root, camera)
     versions = {entry.generation: readable(folder, entry.generation) for entry in log}
     ours = [number for number, version in versions.items() if version and same_solve(version, now)]
     earlier = [version for number, version in versions.items() if version and number not in ours]
-    drift = [check for check in read_checks(root, camera) if check.generation in ours]
-    return Installed(now, validity, tuple(earlier), tuple(drift), tuple(log))
+    drift = [check for check in checks if check.generation in ours]
+    return Installed(now, validity, tuple(earlier), tuple(drift), tuple(checks), tuple(log))
 
 
 def readable(folder: Path, version: int | None = None) -> Calibration | None:
@@ -110,11 +112,15 @@ def state_root(calibration: str | Path) -> Path:
 
 
 def solved_file(session: SessionStatus, root: Path, camera: str) -> str:
-    """Return the calibration file made from a session, or judged by it as a drift check; empty: none yet."""
-    folder = Path(session.folder)
-    if session.check and (now := read_installed(root, camera).now) is not None:
-        folder = folder.with_name(now.provenance.session)
-    path = folder / CALIBRATION_FILE
+    """Return the calibration file made from a session; empty: none yet.
+
+    Before a session and in a drift check, that of what is installed.
+    """
+    path = Path(session.folder) / CALIBRATION_FILE
+    if session.check or not session.name:
+        if (now := read_installed(root, camera).now) is None:
+            return ""
+        path = root / "sessions" / now.provenance.session / CALIBRATION_FILE
     return str(path) if path.is_file() else ""
 
 
@@ -188,7 +194,7 @@ class Kept:
 def read_sessions(root: Path, camera: str) -> tuple[Kept, ...]:
     """Read what became of each session, newest first; for a thread."""
     installed = read_installed(root, camera)
-    judged = {check.recording: check for check in read_checks(root, camera)}
+    judged = {check.recording: check for check in installed.checks}
     return tuple(
         Kept(
             session,

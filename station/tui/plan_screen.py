@@ -20,7 +20,8 @@ from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
 from station.tui.words import ERROR_SHOWN_MM, MARKS, UNKNOWN, dim, error_facts, facts, mark
 
 COLUMNS = ("#", "error", "state", "reason")
-NO_PLAN = "No plan yet: F5 makes one and asks, n only makes it. Nothing moves."
+NO_PLAN = "No plan yet: F5 makes one and asks, n only makes it."
+BY_HAND = "A person moves this arm: F3 takes views, and needs no plan."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses: takes some seconds, nothing moves"
@@ -50,8 +51,8 @@ def facts_line(known: Known) -> Content:
     """Sum the plan up in one line."""
     session, goal_mm = known.shown.session, known.goal_mm
     if not (poses := session.poses):
-        return dim(NO_PLAN)
-    end_mm = poses[-1].predicted_sigma_mm
+        return dim(BY_HAND if known.shown.robot.by_hand else NO_PLAN)
+    end_mm = poses[-1].estimated_sigma_mm or poses[-1].predicted_sigma_mm
     line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose")) + Content("   ")
     line += error_facts("predicted error at the end", end_mm, session.working_distance_m)
     if end_mm is not None and goal_mm is not None:
@@ -87,7 +88,7 @@ class PlanScreen(StationScreen):
     def _cell(self, known: Known, width: int, height: int) -> Content:
         scene = cell_scene(known.configuration, known.shown)
         if scene is None:
-            return dim("No drawing: no initial poses are configured, or this console has no signs for it.")
+            return dim("No drawing: no initial poses are\nconfigured, or this console lacks signs.")
         chosen = self.table.cursor_row if known.shown.session.poses else None
         return draw(scene, known.shown, chosen, width, height)
 

@@ -89,8 +89,6 @@ def _chip(pose: PoseStatus, current: bool, cells: int) -> Content:
     kind = pose_mark(pose)
     if current and pose.state in _STEPS:
         kind = "now"
-    elif kind == "done" and pose.attempt > 1:
-        kind = "look"
     sign, style = CHIPS[kind]
     return Content.styled(f"{number}{'-' if pose.state == 'skipped' else sign} ", style)
 

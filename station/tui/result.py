@@ -34,7 +34,7 @@ from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, sentence
 
 NO_RESULT = "No result yet: F9 solves what was captured. On 5, Enter shows older ones."
 SHOWN = {"PASS": ("✓", "-pass"), "PASS WITH A REASON": ("▲", "-reason"), "FAIL": ("✗", "-fail")}
-BAR_CELLS, NAME_CELLS = 14, 27
+BAR_CELLS, NAME_CELLS = 12, 27
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
 Row = tuple[tuple[Content, ...], str]
 """A row of the table of checks, and what Enter tells of it."""

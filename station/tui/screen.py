@@ -111,6 +111,9 @@ class StationScreen(Framed[None]):
         if self.LOOK:
             await self.app.run_action(self.LOOK)
 
+    def does_something(self, action: str) -> bool:
+        return action != f"switch_mode('{self.MODE}')" and super().does_something(action)
+
     def on_screen_suspend(self) -> None:
         for preview in self.query(PreviewPane):
             preview.soften()

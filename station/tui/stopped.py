@@ -7,7 +7,6 @@ from textual.widgets import Static
 
 from station.cell.status import StationStatus
 from station.protocol.states import LATCHED
-from station.tui.progress import pose_under_way
 from station.tui.task import Known
 from station.tui.words import UNKNOWN, lines, mark, sentence
 
@@ -35,17 +34,9 @@ class Stopped(Static):
 
 def stopped_text(status: StationStatus) -> Content:
     session, robot = status.session, status.robot
-    on_way = pose_under_way(status)
-    again = (
-        f" Pose {on_way.index + 1} was on its way and is captured again."
-        if on_way and on_way.state != "done"
-        else ""
-    )
-    saved = (
-        f"{session.captured} of {len(session.poses)} poses are saved.{again}"
-        if session.poses
-        else "No session was running."
-    )
+    saved = f"{session.captured} of {len(session.poses)} poses are saved."
+    if not session.poses:
+        saved = "No session was running."
     held, told = robot.condition.held, robot.condition.safety
     pendant = mark("look", held) if held else mark("done", "nothing to clear there") if told else Content()
     if not held:

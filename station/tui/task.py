@@ -47,7 +47,8 @@ class Action:
         """Add the key that leads there, on any other screen."""
         if not self.at or self.at == mode:
             return self
-        return Action(DIGITS[self.at], self.label, f"then {self.key}. {self.why}", look=self.look)
+        then = f"then {self.key}. " if self.key else ""
+        return Action(DIGITS[self.at], self.label, then + self.why, look=self.look)
 
 
 @dataclass(frozen=True)
@@ -221,8 +222,8 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
         why = f"{sentence(status.reason)} Look at the cell first; F8 moves nothing.".strip()
         return Action("F8", "Acknowledge", why, look=True)
     if state is StationState.DISCONNECTED and not (status.robot.by_hand and status.session.recording):
-        why = status.reason or "The robot does not answer."
-        return Action("1", "See what is missing", why, look=True)
+        why = sentence(status.reason) or "The robot does not answer."
+        return Action("", "See what is missing", why, at="connect", look=True)
     if status.guidance.outline and state in (*RUNNING, StationState.FREE_DRIVE):
         return _by_hand(status)
     if state in RUNNING:
@@ -255,6 +256,8 @@ def _by_hand(status: StationStatus) -> Action:
 
 def to_wanted(guidance: GuidanceStatus, seen: DetectionStatus) -> Action:
     """Tell the way from what is seen to the wanted view."""
+    if seen.cause == NO_IMAGE:
+        return Action("", "No image", sentence(seen.reason), look=True)
     if not seen.found:
         return Action("", "Show the whole board", seen.reason)
     why = guidance.warning or "The outline in the picture shows it. A new view is taken when all is still."
@@ -264,10 +267,11 @@ def to_wanted(guidance: GuidanceStatus, seen: DetectionStatus) -> Action:
 def _at_rest(known: Known, status: StationStatus) -> Action:
     session, result, missing = status.session, known.result, known.missing
     if missing is not None and not session.recording:  # solving and installing need no device
-        return Action("1", f"Mend: {missing.name}", missing.remedy or missing.text, look=True)
+        why = sentence(missing.remedy or missing.text)
+        return Action("", f"Mend: {missing.name}", why, at="connect", look=True)
     if session.poses and not session.recording:
-        asks = f"{status.reason} Shows the motion and asks first.".strip()
-        return Action("F5", "Start the capture", asks)
+        asks = f"Shows the motion to {many(len(session.poses), 'pose')} and asks first."
+        return Action("F5", "Start the capture", f"{sentence(status.reason)} {asks}".strip())
     judged = result is not None and session.name in {check.recording for check in result.state.drift}
     if session.check and session.recording and not judged:
         return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
@@ -281,7 +285,7 @@ def _at_rest(known: Known, status: StationStatus) -> Action:
 def _with_result(result: Result, status: StationStatus) -> Action:
     calibration = result.calibration
     if calibration is None:
-        return Action("5", "Choose a session", result.problem, look=True)
+        return Action("", "Choose a session", result.problem, at="sessions", look=True)
     step = after_solve(calibration, () if result.installed else result.objections)
     if result.installed and (validity := result.state.validity) is not None and result.state.doubted:
         return Action("n", "Plan 25 poses", sentence(validity_text(validity)), at="plan", look=True)
@@ -292,4 +296,4 @@ def _with_result(result: Result, status: StationStatus) -> Action:
         return Action("i", "Install", f"PASS: {step.text}.{touch}", at="result")
     if step.kind is StepKind.RETAKE:
         return Action("n", "Plan and retake", step.text, at="plan", look=True)
-    return Action("4", "See what failed", f"Look for: {step.text}", look=True)
+    return Action("", "See what failed", f"Look for: {step.text}", at="result", look=True)

@@ -60,5 +60,5 @@ def test_next_is_the_way_until_it_is_enough() -> None:
     assert next_action(Known(by_hand(12, enough=True))).key == "F7"
     silent = msgspec.structs.replace(by_hand(12), state=StationState.DISCONNECTED, guidance=GuidanceStatus())
     silent = msgspec.structs.replace(silent, robot=msgspec.structs.replace(silent.robot, by_hand=True))
-    assert next_action(Known(silent)).key == "1"
+    assert next_action(Known(silent)).on("capture").key == "1"
     assert next_action(Known(in_session(silent, recording="session.mcap"))).key == "F9", "it needs no arm"

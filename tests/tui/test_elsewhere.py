@@ -11,6 +11,7 @@ from textual.widgets import DataTable
 
 from calibrate.check.history import CheckEntry, append_check
 from calibrate.files.calibration import write_calibration
+from calibrate.files.folders import calibrations_folder
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
 from station.tui import app as app_module
@@ -114,6 +115,19 @@ async def test_after_a_drift_check_the_result_is_what_it_judged(link: FakeLink, 
         assert next_action(app.known).key == "k"
         append_check(CheckEntry(0.0, 1, "s-2", True, (0.0,) * 6, 1.0, 12.6), root)
         await until(pilot, lambda: next_action(app.known).key == "d")
+
+
+async def test_before_a_session_the_result_is_what_is_installed(link: FakeLink, root: Path) -> None:
+    """As a daemon knows nothing of the days before; and a file that cannot be read hides nothing else."""
+    put(root, "s-1")
+    (calibrations_folder(root) / "checks.jsonl").mkdir()
+    link.show(in_session(idle(), name="", poses=()))
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: app.known.result and app.known.sessions)
+        assert next_action(app.known).key == "d"
+        link.show(in_session(idle(), name="s-3"))
+        await until(pilot, lambda: app.known.result is None)
 
 
 async def test_the_result_of_the_session_just_captured_needs_no_picking(link: FakeLink, root: Path) -> None:

@@ -84,6 +84,9 @@ async def test_the_palette_names_the_screen_s_own_keys_too_and_stop_works_in_it(
         await pilot.pause()
         named = {command.title: command for command in pilot.app.get_system_commands(pilot.app.screen)}
         assert {"Retake (r)", "Pause (f6)", "STOP (f12)"} <= set(named)
+        assert {title for title in named if not title.endswith(")")} == {"Theme"}, (
+            "others hide STOP, or leave"
+        )
         named["Skip (s)"].callback()
         await until(pilot, lambda: verbs.Skip(0) in link.asked)
         await pilot.press("f1")
@@ -102,7 +105,7 @@ async def test_only_what_ends_control_of_an_arm_at_work_asks(
     async with opened(link) as pilot:
         link.show(shown := commanded(state, holder))
         await until(pilot, lambda: pilot.app.known.status == shown)
-        await pilot.press("ctrl+q")
+        await pilot.app.run_action("quit")
         await until(pilot, lambda: pilot.app._exit or pilot.app.screen.query("#confirm-body"))
         assert pilot.app._exit is not asks and verbs.Release() not in link.asked
 

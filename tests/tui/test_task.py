@@ -10,7 +10,10 @@ from textual.screen import Screen
 
 from recordings.schema.messages import RobotIdentity
 from station.cell.status import (
+    NO_IMAGE,
     ArmCondition,
+    DetectionStatus,
+    GuidanceStatus,
     LeaseStatus,
     RecorderStatus,
     RobotStatus,
@@ -39,6 +42,12 @@ def held(state: StationState) -> StationStatus:
     )
 
 
+def guided(seen: DetectionStatus) -> StationStatus:
+    """By hand, while the camera sees this."""
+    guidance = GuidanceStatus(outline=((0.0, 0.0), (1.0, 1.0)), words="Closer")
+    return msgspec.structs.replace(idle(StationState.FREE_DRIVE), detection=seen, guidance=guidance)
+
+
 CASES = [
     (Known(), ""),
     (Known(idle(), silent_s=3.0), ""),
@@ -59,18 +68,21 @@ CASES = [
     (Known(resting(poses=())), "F5"),
     (Known(resting(name="")), "F5"),
     (Known(resting(recording="/r")), "F9"),
-    (Known(resting(recording="/r", check=True)), "k"),
+    (Known(resting(recording="/r", check=True)), DIGITS["sessions"]),
 ]
 
 
 @pytest.mark.parametrize(("known", "key"), CASES)
 def test_every_state_has_one_next_action(known: Known, key: str) -> None:
-    assert next_action(known).key == key
+    assert next_action(known).on("capture").key == key
 
 
 def test_a_key_of_another_screen_becomes_the_way_there() -> None:
     action = next_action(Known(resting(recording="/r", check=True)))
     assert (action.on("sessions").key, action.on("capture").key) == ("k", DIGITS["sessions"])
+    lost = next_action(Known(idle(StationState.DISCONNECTED)))
+    assert (lost.on("connect").key, lost.on("capture").key) == ("", DIGITS["connect"])
+    assert next_action(Known(guided(DetectionStatus(cause=NO_IMAGE)))).look, "the board is not to blame"
 
 
 @pytest.mark.parametrize("known", [known for known, _ in CASES])

@@ -20,7 +20,7 @@ from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
 from station.cell.errors import StationError
-from station.cell.status import MotionPreview, SessionStatus, StationState
+from station.cell.status import MotionPreview, SessionStatus, StationState, StationStatus
 from station.operate.motion import PREPARE_S, prepared_motion
 from station.protocol import verbs
 from station.protocol.client import Client
@@ -28,7 +28,7 @@ from station.protocol.states import RUNNING
 from station.protocol.verbs import PreviewImage, Purpose
 from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
-from station.tui.daemon_link import SILENT_S, DaemonApp, DaemonLink, StatusChanged, TerminalWatch
+from station.tui.daemon_link import SILENT_S, DaemonApp, DaemonLink, TerminalWatch
 from station.tui.dialogs import Confirm, ConfirmMotion
 from station.tui.installed import Marks, marks, read_result, read_sessions, solved_file, state_root
 from station.tui.jobs import check_drift, solve_session
@@ -136,10 +136,10 @@ class StationApp(LivePageApp[None], DaemonApp):
                     picture = await self.link.client.call(verbs.Preview(SIDE_PX, SIDE_PX), timeout_s=SILENT_S)
                 page.publish(news_of(self.known, picture))
 
-    def on_status_changed(self, message: StatusChanged) -> None:
-        before, status = self.known.live, message.status
+    def hear(self, status: StationStatus | None, why: str = "") -> None:
+        before = self.known.live
         if status is None:
-            self.known = replace(self.known, gone=message.why, silent_s=None)
+            self.known = replace(self.known, gone=why, silent_s=None)
             return
         self.known = replace(self.known, status=status, gone="")
         if before is None or before.session.recording != status.session.recording:

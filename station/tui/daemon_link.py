@@ -7,10 +7,9 @@ import time
 from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
-from textual.message import Message
 from textual.reactive import reactive
 from textual.screen import Screen
 
@@ -34,19 +33,12 @@ STATUS_PERIOD_S = 0.25
 RECONNECT_S = 1.0
 GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
-REMEDIES = {
-    "nothing-installed": "4 shows the newest result, i installs it.",
-    "unfinished-recording": "c on 5 recovers it.",
+BUSY: dict[type[Verb[Any]], str] = {
+    verbs.MakePlan: "Planning …",
+    verbs.Prepare: "Checking the path …",
+    verbs.Observe: "Looking for the board …",
 }
-"""By an error's code, where the way out on a screen is another than in a shell."""
-
-
-class StatusChanged(Message):
-    """None: there is no daemon, and `why`."""
-
-    def __init__(self, status: StationStatus | None, why: str = "") -> None:
-        super().__init__()
-        self.status, self.why = status, why
+"""Words for a verb that takes seconds, or minutes on a busy computer. Others are answered at once."""
 
 
 class DaemonApp(ThemedApp[None]):
@@ -56,6 +48,9 @@ class DaemonApp(ThemedApp[None]):
     result_path: reactive[str] = reactive("", repaint=False, always_update=True)
     """The calibration file that the result screen shows; empty: that of the session just captured."""
     link: DaemonLink
+
+    def hear(self, status: StationStatus | None, why: str = "") -> None:
+        """Take the newest status; None: there is no daemon, and `why`."""
 
     async def show_result(self, calibration: str) -> None:
         """Open a calibration file."""
@@ -88,13 +83,13 @@ class DaemonLink:
                 self.app.run_worker(self._listen(), group="listen", exclusive=True)
                 async for status in self.client.statuses():
                     await self._pace(status)
-                    self.app.post_message(StatusChanged(status))
+                    self.app.hear(status)
             except (OSError, StationError) as problem:
                 why = str(problem)
             except msgspec.ValidationError as problem:
                 why = f"The daemon is of another version than this screen ({problem}): restart the older one."
             await self.client.close()
-            self.app.post_message(StatusChanged(None, why))
+            self.app.hear(None, why)
             await asyncio.sleep(RECONNECT_S)
 
     async def _pace(self, status: StationStatus) -> None:
@@ -127,10 +122,10 @@ class DaemonLink:
         """Show what takes long on every screen; to a daemon that is silent send nothing but STOP."""
         if self.known.silent_s is not None and not isinstance(verb, verbs.Stop | verbs.Watch):
             raise StationError("daemon-silent")
-        words = busy_words(verb)
+        words = BUSY.get(type(verb))
         if words and self.known.busy:
             raise RefusedError("screen-busy", work=self.known.busy)
-        with self.busy(words) if words else nullcontext():
+        with self.busy(f"{words} Nothing moves.") if words else nullcontext():
             yield
 
     @contextmanager
@@ -156,7 +151,7 @@ class DaemonLink:
         except (CodedError, OSError) as problem:
             refused = isinstance(problem, RefusedError)
             self.app.notify(
-                told(problem), severity="warning" if refused else "error", timeout=10, markup=False
+                str(problem), severity="warning" if refused else "error", timeout=10, markup=False
             )
         return None
 
@@ -190,25 +185,6 @@ class DaemonLink:
         if self.known.silent_s is not None:
             self.app.notify(STOP_UNHEARD, severity="error", timeout=10)
         await self.attempt(self.client.call(verbs.Stop()))
-
-
-def told(problem: CodedError | OSError) -> str:
-    """The text of an error with the remedy that a screen offers."""
-    if isinstance(problem, OSError) or problem.code not in REMEDIES:
-        return str(problem)
-    return f"{problem.text.rstrip('.')}. {REMEDIES[problem.code]}"
-
-
-def busy_words(verb: Verb[object]) -> str:
-    """Words for a verb that takes seconds, or minutes on a busy computer; empty: it is answered at once."""
-    match verb:
-        case verbs.MakePlan():
-            return f"Planning {verb.poses} poses … Nothing moves."
-        case verbs.Prepare():
-            return "Checking the path … Nothing moves."
-        case verbs.Observe():
-            return "Looking for the board … Nothing moves."
-    return ""
 
 
 WHERE_IS_THE_CURSOR = "\x1b[6n"

@@ -19,8 +19,9 @@ from calibrate.files.install import reason_problem
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
 from station.tui.frame import Frame, Question
-from station.tui.task import Action
-from station.tui.widgets.cell_drawing import cell_scene, draw
+from station.tui.screen import Panel
+from station.tui.task import Action, Known
+from station.tui.widgets.cell_drawing import draw
 from station.tui.words import duration, hanging, limit_bar, lines
 
 TERMINATE_S = 5.0
@@ -64,13 +65,13 @@ class ConfirmMotion(Confirm):
 
     def __init__(self, preview: MotionPreview) -> None:
         super().__init__("The arm will move", "", yes="Start motion", no="Do not move")
-        self._preview, self._drawn = preview, False
+        self._preview = preview
         self._until_s = time.monotonic() + APPROVAL_LIFETIME_S
 
     def body(self) -> ComposeResult:
         with Horizontal(id="motion-facts"):
             yield Static(motion_text(self._preview, self.app.size.width - ROUND_IT), id="confirm-body")
-            yield Static(id="motion-scene")
+            yield Panel("The first pose", _first_pose, id="motion-scene")
         yield Static(id="motion-holds")
         yield from self.buttons()
 
@@ -78,18 +79,11 @@ class ConfirmMotion(Confirm):
         self.set_interval(1.0, self._count_down)
         self._count_down()
 
-    def _draw(self) -> None:
-        """Draw the first move, once: the pane has its size after the screen's first layout."""
-        pane, status = self.query_one("#motion-scene", Static), self.known.shown
-        scene = cell_scene(self.known.configuration, status)
-        if scene is not None and pane.display and pane.size.width > 20 and not self._drawn:
-            self._drawn = True
-            poses = status.session.poses
-            first = next((place for place, pose in enumerate(poses) if pose.state == "planned"), None)
-            pane.update(draw(scene, status, first, *pane.size))
+    def show(self, known: Known) -> None:
+        super().show(known)
+        self.query_one(Panel).show(known)
 
     def _count_down(self) -> None:
-        self.call_after_refresh(self._draw)
         left_s = max(0.0, self._until_s - time.monotonic())
         line = Content.assemble(
             ("this question expires in ", "$dim"), (duration(left_s), "bold $strong"), "  "
@@ -100,6 +94,12 @@ class ConfirmMotion(Confirm):
         if not left_s:
             self.notify("The question expired: nothing moved. F5 asks again.", severity="warning")
             self.dismiss(False)
+
+
+def _first_pose(known: Known, width: int, height: int) -> Content:
+    status = known.shown
+    first = next((k for k, pose in enumerate(status.session.poses) if pose.state == "planned"), None)
+    return draw(known.configuration, status, first, width, height)
 
 
 def motion_text(preview: MotionPreview, room: int) -> Content:

@@ -71,24 +71,24 @@ async def install_result(link: DaemonLink, result: Result, calibration: Calibrat
     config = link.client.config
     oldest = None if config is None else config.validity.max_age_days
     put = partial(install, Path(result.path), state_root(result.path), cell=cell, max_age_days=oldest)
+    if await link.attempt(_installed(link, put)) is not None:
+        link.app.result_path = result.path  # read again at once
+        link.app.notify("Installed. b undoes it.")
+
+
+async def _installed(link: DaemonLink, put: partial[InstalledVersion]) -> InstalledVersion | None:
+    """Install, where it is refused with a person's reason; None: none was given. Raises CalibrationError."""
     try:
-        try:
-            with link.busy("Installing …"):
-                await asyncio.to_thread(put)
-        except CalibrationError as refusal:
-            if refusal.code not in OVERRIDABLE:
-                raise
-            if not (
-                reason := await link.ask_person(Reason("Not installed", f"{refusal.text}\n\n{OVERRIDES}"))
-            ):
-                link.app.notify("Nothing was installed.")
-                return
-            await asyncio.to_thread(put, override=reason)
+        with link.busy("Installing …"):
+            return await asyncio.to_thread(put)
     except CalibrationError as refusal:
-        link.app.notify(str(refusal), title="Not installed", severity="error", timeout=20, markup=False)
-        return
-    link.app.result_path = result.path  # read again at once
-    link.app.notify("Installed. b undoes it.")
+        if refusal.code not in OVERRIDABLE:
+            raise
+        asked = f"{refusal.text}\n\n{OVERRIDES}"
+    if reason := await link.ask_person(Reason("Not installed", asked)):
+        return await asyncio.to_thread(put, override=reason)
+    link.app.notify("Nothing was installed.")
+    return None
 
 
 async def undo_install(link: DaemonLink, result: Result, calibration: Calibration) -> None:

@@ -16,7 +16,7 @@ from station.tui.frame import Line
 from station.tui.progress import pose_mark
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
+from station.tui.widgets.cell_drawing import LEGEND, draw
 from station.tui.words import ERROR_SHOWN_MM, MARKS, UNKNOWN, dim, error_facts, facts, mark
 
 COLUMNS = ("#", "error", "state", "reason")
@@ -86,11 +86,8 @@ class PlanScreen(StationScreen):
         self.draw_panels(known)
 
     def _cell(self, known: Known, width: int, height: int) -> Content:
-        scene = cell_scene(known.configuration, known.shown)
-        if scene is None:
-            return dim("No drawing: no initial poses are\nconfigured, or this console lacks signs.")
         chosen = self.table.cursor_row if known.shown.session.poses else None
-        return draw(scene, known.shown, chosen, width, height)
+        return draw(known.configuration, known.shown, chosen, width, height)
 
     def on_data_table_row_selected(self) -> None:
         """Tell all of a pose, of which the table may show the beginning."""

@@ -17,7 +17,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch, touch_text
 from recordings.errors import CodedError
 from station.operate.tip_offsets import SeenBoard, note_touches, read_touch, see_board
-from station.tui.daemon_link import DaemonLink, told
+from station.tui.daemon_link import DaemonLink
 from station.tui.frame import Question
 from station.tui.installed import Result, state_root
 
@@ -59,7 +59,7 @@ class TouchCorners(Question[list[Touch]]):
         try:
             self._found[corner] = read_touch(self._board, corner, now)
         except CodedError as refused:
-            problem = told(refused)
+            problem = str(refused)
         else:
             event.option_list.replace_option_prompt(str(corner), self._line(corner))
             event.option_list.action_cursor_down()

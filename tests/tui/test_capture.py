@@ -8,13 +8,12 @@ import pytest
 
 from calibrate.geometry import pose as pose_of
 from station.cell.config import matrix4
-from station.cell.layout import layout_of
 from station.cell.status import ArmCondition, EstimateStatus, PoseStatus, StationState
 from station.tui.capture_panels import coverage_lines, error_columns, error_lines
 from station.tui.progress import chips, pose_line
 from station.tui.stopped import stopped_text
 from station.tui.task import Known
-from station.tui.widgets.cell_drawing import cell_scene, draw
+from station.tui.widgets.cell_drawing import draw
 from tests.recordings.small_recording import make_state
 from tests.tui.conftest import CELL, FakeLink, idle, in_session, opened, until
 
@@ -122,8 +121,8 @@ def test_the_scene_shows_arm_board_and_table(monkeypatch: pytest.MonkeyPatch) ->
     status = in_session(idle(), poses=(seeing(0.6, 0.0), seeing(0.5, 0.2)))
     standing = msgspec.structs.replace(make_state(0), joints_rad=(0.0, -1.6, -1.5, -1.6, 1.5, 0.0))
     status = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, state=standing))
-    drawn = draw(layout_of(CELL), status, 0, 60, 24).plain
+    drawn = draw(CELL, status, 0, 60, 24).plain
     assert "board" in drawn and "table" in drawn
     assert len({letter for letter in drawn if ord(letter) > 0x2500}) > 2
     monkeypatch.setenv("TERM", "linux")
-    assert cell_scene(CELL, status) is None, "its font has no braille"
+    assert "board" not in draw(CELL, status, 0, 60, 24).plain, "its font has no braille"

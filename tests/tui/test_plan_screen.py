@@ -8,7 +8,7 @@ import msgspec
 from textual.widgets import DataTable
 
 from station.protocol import verbs
-from station.tui.daemon_link import busy_words
+from station.tui.daemon_link import BUSY
 from tests.tui.conftest import FakeLink, idle, in_session, opened, said, text_of, until
 
 
@@ -30,7 +30,7 @@ async def test_it_says_that_it_plans_for_as_long_as_it_does() -> None:
     link = SlowPlanner()
     async with opened(link, notifications=True) as pilot:
         await pilot.press("2", "n")
-        await until(pilot, lambda: busy_words(verbs.MakePlan(25)) in text_of(pilot.app, "#next"))
+        await until(pilot, lambda: BUSY[verbs.MakePlan] in text_of(pilot.app, "#next"))
         await pilot.press("n")
         await until(pilot, lambda: "Busy" in said(pilot))
         assert link.verbs.count("make_plan") == 1

@@ -236,8 +236,7 @@ ASKS: dict[str, type[Verb[Any]]] = {
 NEEDS: dict[str, Callable[[Known], object]] = {
     "solve_newest": lambda now: now.shown.session.recording and not now.result,
     "act('install')": lambda now: now.result and (now.result.state.withdrawn or not now.result.installed),
-    "act('undo')": lambda now: now.result and now.result.state.now,
-    "app.drift_check": lambda n: n.result.state.now if n.result else any(k.word for k in n.sessions or ()),
+    **dict.fromkeys(("act('undo')", "app.drift_check"), lambda now: now.result and now.result.state.now),
     **dict.fromkeys(("report", "act('touch test')"), lambda now: now.result),
     **dict.fromkeys(("pose('retake')", "pose('skip')"), lambda now: now.shown.session.poses),
     **dict.fromkeys(("act('solve')", "act('check')"), lambda now: now.sessions),

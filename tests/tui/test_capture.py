@@ -15,7 +15,7 @@ from station.tui.stopped import stopped_text
 from station.tui.task import Known
 from station.tui.widgets.cell_drawing import draw
 from tests.recordings.small_recording import make_state
-from tests.tui.conftest import CELL, FakeLink, idle, in_session, opened, until
+from tests.tui.conftest import CELL, idle, in_session
 
 
 def test_steps_of_a_pose_are_marked_one_after_the_other() -> None:
@@ -46,16 +46,6 @@ def test_the_chip_of_the_pose_under_way_is_always_there(
     assert max(map(len, shown)) <= width
     if current is not None:
         assert f"{current + 1}▶" in "".join(shown)
-
-
-async def test_the_pose_under_way_is_told_by_its_number(link: FakeLink) -> None:
-    poses = tuple(
-        PoseStatus(index=i, name=f"p{i + 1}", state="moving" if i == 4 else "planned") for i in range(7)
-    )
-    moving = in_session(idle(StationState.MOVING), poses=poses, current=4)
-    link.show(moving)
-    async with opened(link) as pilot:
-        await until(pilot, lambda: pilot.app.screen.query_one("#progress").border_title == "Pose 5 of 7")
 
 
 @pytest.mark.parametrize("cause", ["stop", "protective-stop", "stale-state"])

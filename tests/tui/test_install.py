@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -21,10 +20,9 @@ from calibrate.files.touch import Touch
 from calibrate.files.validity import Validity, ValidityReason, ValidityState
 from calibrate.files.versions import installed_versions, note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
-from station.cell.session_folder import SessionSummary
 from station.cell.status import StationState
 from station.tui.dialogs import Confirm, Reason
-from station.tui.installed import Installed, Kept, Result, read_installed
+from station.tui.installed import Installed, Result, read_installed
 from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
@@ -186,20 +184,6 @@ async def test_every_key_that_does_something_is_in_the_footer(
         keys = {key.key: key.region.right for key in pilot.app.screen.query(FooterKey)}
         assert max(keys.values()) <= 80 and "i" not in keys and "b" in keys
         assert ("d" in keys, "f6" in keys) == (state is not StationState.MOVING, state is StationState.MOVING)
-
-
-async def test_what_is_installed_is_checked_days_later_without_a_result(link: FakeLink) -> None:
-    session = SessionSummary("s-1", "/s-1", "/s-1/r.mcap", "robot", 25, True, "")
-    link.show(idle())
-    async with opened(link) as pilot:
-
-        def keys(word: str) -> set[str]:
-            pilot.app.known = replace(pilot.app.known, sessions=(Kept(session, GOOD, word),))
-            return {key.key for key in pilot.app.screen.query(FooterKey)}
-
-        await pilot.press("4")
-        await until(pilot, lambda: "d" in keys("INSTALLED"))
-        await until(pilot, lambda: "d" not in keys(""))
 
 
 def test_what_is_installed_and_its_validity_are_of_one_version(

@@ -16,7 +16,6 @@ from textual._compositor import Compositor
 from textual.pilot import Pilot
 
 from station.cell.status import StationState
-from station.protocol import verbs
 from station.tui.dialogs import ConfirmMotion
 from station.tui.widgets.preview import PreviewPane, sharp_widget
 from tests.tui.conftest import FakeLink, app_on, idle, opened, until
@@ -144,17 +143,3 @@ async def test_a_status_repaints_only_what_it_changes(
         await until(pilot, lambda: updates)
         await pilot.pause(0.3)
         assert "LayoutUpdate" not in updates
-
-
-@pytest.mark.usefixtures("sharp_panes")
-async def test_until_the_next_sharp_picture_is_due_only_the_smallest_is_asked_for(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(160, 48)) as pilot:
-        await until(pilot, lambda: sharp(pilot))
-        preview = pilot.app.screen.query_one(PreviewPane)
-        preview._next_s = float("inf")
-        link.asked.clear()
-        await preview.fetch(link)  # what the daemon finds in it is still told by the status
-        assert link.asked[-1] == verbs.Preview(16, 16)
-        preview._next_s = 0.0
-        await preview.fetch(link)
-        assert isinstance(asked := link.asked[-1], verbs.Preview) and asked.width > 160

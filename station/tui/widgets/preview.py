@@ -44,8 +44,6 @@ SIGNS = {
 """Signs, and not only colours."""
 OLD = "OLD IMAGE"
 Outline = tuple[tuple[float, float], ...]
-SMALLEST = (16, 16)
-"""Pixels to ask for while no image is drawn: the daemon still looks for the board."""
 FEW_SHADES = " ░▒▓█"
 """Shades of a console with 16 colours, whose backgrounds have no greys: one a cell, dithered."""
 _BAYER = (np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) + 0.5) / 16
@@ -105,21 +103,17 @@ class PreviewPane(Widget):
             yield self.sharp()
 
     async def fetch(self, link: Client) -> None:
-        """Ask for an image and show it. What the daemon sees in it stands in the status, shown or not.
-
-        Until the next one may be drawn the smallest will do: a large one is dear to send and to read.
-        """
-        due = not self._sharp() or time.monotonic() >= self._next_s
-        width, height = self.wanted_pixels() if due else SMALLEST
-        answer = await link.call(verbs.Preview(width, height))
-        if due and answer.jpeg_base64:
-            self.show(answer)
+        """Ask for an image and show it, where one may be drawn already."""
+        if not self._sharp() or time.monotonic() >= self._next_s:
+            self.show(await link.call(verbs.Preview(*self.wanted_pixels())))
 
     def show(self, answer: verbs.PreviewImage) -> None:
-        """Show an image, unless it stands there already."""
+        """Show an image, if there is one and it does not stand there already."""
+        if answer.sequence == self._sequence or not answer.jpeg_base64:
+            return
         data = np.frombuffer(base64.b64decode(answer.jpeg_base64), dtype=np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-        if answer.sequence == self._sequence or image is None:
+        if image is None:
             return
         self._image, self._sequence = np.asarray(image, dtype=np.uint8), answer.sequence
         self._corners = np.array(answer.corners, dtype=float).reshape(-1, 2)

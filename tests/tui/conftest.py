@@ -155,6 +155,11 @@ def in_session(status: StationStatus, **changes: object) -> StationStatus:
     return msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, **changes))
 
 
+def with_robot(status: StationStatus, **changes: object) -> StationStatus:
+    """The status with fields of its robot replaced."""
+    return msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, **changes))
+
+
 def commanded(state: StationState, client_id: int = 7) -> StationStatus:
     """The screen of `FakeLink` is client 7."""
     return msgspec.structs.replace(idle(state), lease=LeaseStatus("anna on tty1", client_id))

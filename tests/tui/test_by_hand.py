@@ -8,7 +8,7 @@ from station.cell.status import DetectionStatus, GuidanceStatus, PoseStatus, Sta
 from station.protocol import verbs
 from station.tui.task import Known, next_action
 from station.tui.widgets.preview import PreviewPane
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, until
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, until, with_robot
 
 OUTLINE = ((0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
 
@@ -59,6 +59,6 @@ def test_next_is_the_way_until_it_is_enough() -> None:
     assert moved.look and moved.why == "The board moved."
     assert next_action(Known(by_hand(12, enough=True))).key == "F7"
     silent = msgspec.structs.replace(by_hand(12), state=StationState.DISCONNECTED, guidance=GuidanceStatus())
-    silent = msgspec.structs.replace(silent, robot=msgspec.structs.replace(silent.robot, by_hand=True))
+    silent = with_robot(silent, by_hand=True)
     assert next_action(Known(silent)).on("capture").key == "1"
     assert next_action(Known(in_session(silent, recording="session.mcap"))).key == "F9", "it needs no arm"

@@ -15,7 +15,7 @@ from station.tui.stopped import stopped_text
 from station.tui.task import Known
 from station.tui.widgets.cell_drawing import draw
 from tests.recordings.small_recording import make_state
-from tests.tui.conftest import CELL, idle, in_session
+from tests.tui.conftest import CELL, idle, in_session, with_robot
 
 
 def test_steps_of_a_pose_are_marked_one_after_the_other() -> None:
@@ -53,17 +53,14 @@ def test_the_card_says_that_the_arm_stands_only_where_it_is_known(cause: str) ->
     status = msgspec.structs.replace(idle(StationState.STOPPED, "why it stopped"), cause=cause)
 
     def said(**robot: object) -> str:
-        shown = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, **robot))
-        return stopped_text(shown).plain.splitlines()[0]
+        return stopped_text(with_robot(status, **robot)).plain.splitlines()[0]
 
     assert status.robot.connected
     rests = said(still=True)
     assert ("hy it stopped" in rests) is (cause != "protective-stop")
     assert (said(still=False) == rests) is (cause == "stale-state")
     assert (said(still=True, state=None) == rests) is (cause == "stale-state")
-    untold = msgspec.structs.replace(
-        status, robot=msgspec.structs.replace(status.robot, condition=ArmCondition())
-    )
+    untold = with_robot(status, condition=ArmCondition())
     assert "✓" in stopped_text(status).plain and "✓" not in stopped_text(untold).plain
 
 
@@ -110,7 +107,7 @@ def test_the_parts_of_the_image_without_the_board_are_counted() -> None:
 def test_the_scene_shows_arm_board_and_table(monkeypatch: pytest.MonkeyPatch) -> None:
     status = in_session(idle(), poses=(seeing(0.6, 0.0), seeing(0.5, 0.2)))
     standing = msgspec.structs.replace(make_state(0), joints_rad=(0.0, -1.6, -1.5, -1.6, 1.5, 0.0))
-    status = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, state=standing))
+    status = with_robot(status, state=standing)
     drawn = draw(CELL, status, 0, 60, 24).plain
     assert "board" in drawn and "table" in drawn
     assert len({letter for letter in drawn if ord(letter) > 0x2500}) > 2

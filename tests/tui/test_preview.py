@@ -10,7 +10,6 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-import msgspec
 import pytest
 from textual._compositor import Compositor
 from textual.pilot import Pilot
@@ -18,7 +17,7 @@ from textual.pilot import Pilot
 from station.cell.status import StationState
 from station.tui.dialogs import ConfirmMotion
 from station.tui.widgets.preview import PreviewPane, sharp_widget
-from tests.tui.conftest import FakeLink, app_on, idle, opened, until
+from tests.tui.conftest import FakeLink, app_on, idle, opened, until, with_robot
 
 VT340, PLAIN = b"\x1b[?63;1;2;4;6;9;15;22c", b"\x1b[?62;22c"
 
@@ -138,8 +137,7 @@ async def test_a_status_repaints_only_what_it_changes(
     async with opened(link, size=(160, 48)) as pilot:
         await pilot.pause(1.0)
         monkeypatch.setattr(Compositor, "render_update", noted)
-        status = idle()
-        link.show(msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, speed_m_s=0.1)))
+        link.show(with_robot(idle(), speed_m_s=0.1))
         await until(pilot, lambda: updates)
         await pilot.pause(0.3)
         assert "LayoutUpdate" not in updates

@@ -25,21 +25,10 @@ from station.tui.dialogs import Confirm, ConfirmMotion, Reason
 from station.tui.frame import StopBlock, bar_line, next_line, rail_line
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from tests.recordings.small_recording import make_state
-from tests.tui.conftest import SUMMARY, FakeLink, idle, in_session, opened, said, text_of, until
+from tests.tui.conftest import SUMMARY, FakeLink, idle, in_session, opened, said, text_of, until, with_robot
 
 SIZES = [(80, 24), (160, 48)]
-HELD = "protective stop: find what the arm ran into, then enable it again on the pendant"
-
-
-def resting(state: StationState = StationState.IDLE, **session: object) -> StationStatus:
-    return in_session(idle(state), **session)
-
-
-def held(state: StationState) -> StationStatus:
-    status = idle(state)
-    return msgspec.structs.replace(
-        status, robot=msgspec.structs.replace(status.robot, condition=ArmCondition(held=HELD))
-    )
+HELD = ArmCondition(held="protective stop: find what the arm ran into, then enable it on the pendant")
 
 
 def guided(seen: DetectionStatus) -> StationStatus:
@@ -62,13 +51,13 @@ CASES = [
     (Known(idle(StationState.SEALING)), ""),
     (Known(idle(StationState.PAUSED)), "F5"),
     (Known(idle(StationState.FREE_DRIVE)), "F2"),
-    (Known(held(StationState.IDLE)), ""),
-    (Known(held(StationState.PAUSED)), ""),
+    (Known(with_robot(idle(StationState.IDLE), condition=HELD)), ""),
+    (Known(with_robot(idle(StationState.PAUSED), condition=HELD)), ""),
     (Known(idle(), (Check("camera", "failed", "none", "plug it in"),)), "1"),
-    (Known(resting(poses=())), "F5"),
-    (Known(resting(name="")), "F5"),
-    (Known(resting(recording="/r")), "F9"),
-    (Known(resting(recording="/r", check=True)), DIGITS["sessions"]),
+    (Known(in_session(idle(), poses=())), "F5"),
+    (Known(in_session(idle(), name="")), "F5"),
+    (Known(in_session(idle(), recording="/r")), "F9"),
+    (Known(in_session(idle(), recording="/r", check=True)), DIGITS["sessions"]),
 ]
 
 
@@ -78,7 +67,7 @@ def test_every_state_has_one_next_action(known: Known, key: str) -> None:
 
 
 def test_a_key_of_another_screen_becomes_the_way_there() -> None:
-    action = next_action(Known(resting(recording="/r", check=True)))
+    action = next_action(Known(in_session(idle(), recording="/r", check=True)))
     assert (action.on("sessions").key, action.on("capture").key) == ("k", DIGITS["sessions"])
     lost = next_action(Known(idle(StationState.DISCONNECTED)))
     assert (lost.on("connect").key, lost.on("capture").key) == ("", DIGITS["connect"])
@@ -120,20 +109,20 @@ def test_the_bar_fits_and_keeps_state_and_simulated_first(
 
 
 def test_who_lost_the_daemon_in_a_session_reads_how_many_poses_are_safe() -> None:
-    unfinished = resting(StationState.MOVING, captured=12)
+    unfinished = in_session(idle(StationState.MOVING), captured=12)
     assert "12 poses are safe" in next_action(Known(unfinished, gone="nobody serves there")).why
-    for done in (resting(recording="/r", captured=12), resting(captured=0), resting(name="", captured=0)):
+    for done in (
+        in_session(idle(), recording="/r", captured=12),
+        in_session(idle(), captured=0),
+        in_session(idle(), name="", captured=0),
+    ):
         assert "safe" not in next_action(Known(done, gone="nobody serves there")).why
 
 
 @pytest.mark.parametrize("width", [60, 80, 160])
 @pytest.mark.parametrize("state", [StationState.IDLE, StationState.DISCONNECTED, StationState.MOVING])
 def test_the_bar_says_not_accepted_on_the_smallest_screen(width: int, state: StationState) -> None:
-    robot = RobotStatus(
-        RobotIdentity("UR10e"), make_state(0), ArmCondition(safety="NORMAL"), remote=True,
-        speed_limit_m_s=0.25, control_path="script", not_accepted="not accepted: its stops were never tested",
-    )  # fmt: skip
-    status = msgspec.structs.replace(idle(state), robot=robot, simulated=False)
+    status = with_robot(idle(state), not_accepted="not accepted: its stops were never tested")
     assert "not accepted" in bar_line(Known(status), "Connect", width).plain
 
 
@@ -202,9 +191,8 @@ async def test_stop_stands_whole_on_every_screen_and_question(
 def test_no_step_asks_a_person_who_moves_the_arm_to_let_it_move(
     state: StationState, session: dict[str, object]
 ) -> None:
-    status = resting(state, **session)
-    by_hand = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, by_hand=True))
-    assert next_action(Known(by_hand)).key == "F3"
+    status = in_session(idle(state), **session)
+    assert next_action(Known(with_robot(status, by_hand=True))).key == "F3"
     assert next_action(Known(status)).key in ("F5", "n")
 
 
@@ -212,8 +200,7 @@ def test_no_step_asks_a_person_who_moves_the_arm_to_let_it_move(
 async def test_the_screens_have_no_stop_for_an_arm_that_a_person_moves(
     link: FakeLink, size: tuple[int, int]
 ) -> None:
-    status = idle()
-    link.show(msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, by_hand=True)))
+    link.show(with_robot(idle(), by_hand=True))
     async with opened(link, size, notifications=True) as pilot:
         block = pilot.app.screen.query_one(StopBlock)
         words = str(block.render())

@@ -70,7 +70,7 @@ async def test_every_sample_comes_once_in_order_with_the_time_of_the_controller(
     assert errors[int(0.99 * len(errors))] <= max(0.001, fit.bound_s)
     # Raw arrivals are never before the sample was made, nor after now; both clocks tell the same.
     delays = [(x.stamps.host_monotonic_ns - zero_ns) / 1e9 - x.stamps.controller_s for x in states]
-    assert min(delays) > -1e-4 and sorted(delays)[len(delays) // 2] < 0.02
+    assert -1e-4 < min(delays) < 0.02
     gaps = [x.stamps.host_wall_ns - x.stamps.host_monotonic_ns for x in states]
     assert max(gaps) - min(gaps) < 5_000_000
 

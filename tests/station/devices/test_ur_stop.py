@@ -15,6 +15,7 @@ from station.devices import ur
 from station.devices.rtde import RuntimeState
 from station.devices.ur import UrRobot
 from station.devices.ur_dashboard import STOP
+from tests.patience import PATIENCE_S
 
 
 class Ways:
@@ -118,9 +119,10 @@ def shows(robot: Any, *states: RuntimeState) -> None:
 
 @pytest.mark.parametrize("ready", [True, False])
 async def test_a_program_that_starts_only_after_its_process_was_killed_is_stopped(
-    robot: Any, ways: Ways, ready: bool
+    robot: Any, ways: Ways, monkeypatch: pytest.MonkeyPatch, ready: bool
 ) -> None:
     """Killed before it was ready, its upload may be on the way; later nothing can start any more."""
+    monkeypatch.setattr(ur, "UPLOADED_S", PATIENCE_S)
     ways.started_s *= ready
     shows(robot, RuntimeState.STOPPED, RuntimeState.STOPPED, RuntimeState.PLAYING)
     ways.ended.set()

@@ -12,11 +12,13 @@ import pytest
 from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import RobotState, Vector6
+from station.devices import ur_tool
 from station.devices.ur_tool import PORT, Installation, PrimaryReader, TcpCheck, read_state
 from station.simulation.controller.primary import state
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
 from tests.codes import raises
+from tests.patience import PATIENCE_S
 from tests.recordings.small_recording import PLAYING
 
 UR10 = MODELS["UR10"]
@@ -127,7 +129,10 @@ def test_a_statement_that_comes_after_connecting_must_be_what_was_derived_there(
         nominal.check(sample(FACTORY, HERE, TOOL), stated(FACTORY, TOOL))
 
 
-async def test_a_controller_that_is_slow_to_state_its_tool_is_waited_for() -> None:
+async def test_a_controller_that_is_slow_to_state_its_tool_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ur_tool, "SILENCE_S", PATIENCE_S)
     said, made = asyncio.Event(), SimulatedRobot(Settings(), Journal())
     made.tcp = TOOL
 

@@ -111,18 +111,16 @@ def test_the_bar_fits_and_keeps_state_and_simulated_first(
 def test_who_lost_the_daemon_in_a_session_reads_how_many_poses_are_safe() -> None:
     unfinished = in_session(idle(StationState.MOVING), captured=12)
     assert "12 poses are safe" in next_action(Known(unfinished, gone="nobody serves there")).why
-    for done in (
-        in_session(idle(), recording="/r", captured=12),
-        in_session(idle(), captured=0),
-        in_session(idle(), name="", captured=0),
-    ):
-        assert "safe" not in next_action(Known(done, gone="nobody serves there")).why
+    for done in ({"recording": "/r", "captured": 12}, {"captured": 0}, {"name": "", "captured": 0}):
+        status = in_session(idle(), **done)
+        assert "safe" not in next_action(Known(status, gone="nobody serves there")).why
 
 
 @pytest.mark.parametrize("width", [60, 80, 160])
 @pytest.mark.parametrize("state", [StationState.IDLE, StationState.DISCONNECTED, StationState.MOVING])
 def test_the_bar_says_not_accepted_on_the_smallest_screen(width: int, state: StationState) -> None:
     status = with_robot(idle(state), not_accepted="not accepted: its stops were never tested")
+    status = msgspec.structs.replace(status, simulated=False)
     assert "not accepted" in bar_line(Known(status), "Connect", width).plain
 
 

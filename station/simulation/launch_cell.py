@@ -190,6 +190,4 @@ def _lens_within(camera: CameraModel, rough: bool, rng: np.random.Generator) -> 
     K = np.array(camera.matrix)
     K[[0, 1], [0, 1]] *= 1 + rng.uniform(-_FOCAL_SHARE, _FOCAL_SHARE)
     matrix = tuple(tuple(float(value) for value in row) for row in K)
-    return msgspec.structs.replace(
-        camera, matrix=matrix, distortion=camera.distortion or (_K1, 0.0, 0.0, 0.0, 0.0)
-    )
+    return msgspec.structs.replace(camera, matrix=matrix, distortion=camera.distortion or (_K1,))

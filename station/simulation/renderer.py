@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calibrate.boards.printing import draw_pattern, origin_mm
 from calibrate.geometry import Array
+from calibrate.projection import camera_matrix, project_pixels, undistort
 from recordings.schema.messages import BoardSpec, CameraModel
 
 Floats = NDArray[np.float32]
@@ -112,7 +113,7 @@ def render(
 ) -> NDArray[np.uint8]:
     """Render a mono8 image (height, width); `camera_from_board` (4, 4) at mid-exposure.
 
-    Without `rng` the image is free of noise. ValueError for a camera without a matrix.
+    Without `rng` the image is free of noise. The camera needs a matrix.
     """
     light = light or Light()
     lens = _lens(camera)
@@ -154,16 +155,10 @@ def scaled(camera: CameraModel, factor: float) -> CameraModel:
 
 @lru_cache(maxsize=4)
 def _lens(camera: CameraModel) -> _LensTable:
-    if camera.matrix is None:
-        raise ValueError("the camera has no matrix")
-    if camera.distortion_model == "equidistant":
-        raise ValueError("fisheye lenses are not simulated")
     u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
-    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
-    matrix = np.array(camera.matrix)
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-7)
-    rays = cv2.undistortPointsIter(pixels, matrix, np.array(camera.distortion), np.eye(3), np.eye(3), stop)
-    x, y = np.moveaxis(rays.reshape(camera.height, camera.width, 2), -1, 0)
+    K = camera_matrix(camera)
+    rays = (undistort(camera, np.stack([u, v], axis=-1).reshape(-1, 2)) - K[:2, 2]) / np.diag(K)[:2]
+    x, y = rays.T.reshape(2, camera.height, camera.width)
     corner = np.hypot(camera.width / 2, camera.height / 2)
     radius = np.hypot(u - camera.width / 2, v - camera.height / 2) / corner
     vignetting = 1.0 - VIGNETTING * radius**2
@@ -185,11 +180,9 @@ def _window(
     # The distortion polynomial may map points far outside back into the image: then use the whole image.
     if not ahead.all() or np.abs(in_camera[:, :2] / in_camera[:, 2:]).max() > 1.0:
         return slice(0, camera.height), slice(0, camera.width)
-    lens = np.array(camera.matrix), np.array(camera.distortion)
-    pixels, _ = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), *lens)
-    size = camera.width, camera.height
-    low = np.clip(np.floor(pixels.min(axis=(0, 1))).astype(int) - margin_px, 0, size)
-    high = np.clip(np.ceil(pixels.max(axis=(0, 1))).astype(int) + margin_px + 1, 0, size)
+    pixels, size = project_pixels(camera, in_camera), (camera.width, camera.height)
+    low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin_px, 0, size)
+    high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin_px + 1, 0, size)
     return (slice(low[1], high[1]), slice(low[0], high[0])) if (low < high).all() else None
 
 

@@ -37,13 +37,11 @@ BOARDS = {
 def projected(board: BoardSpec, camera_from_board: Array, camera: CameraModel = CAMERA) -> Array:
     """The oracle."""
     rotation, _ = cv2.Rodrigues(camera_from_board[:3, :3])
-    pixels, _ = cv2.projectPoints(
-        board_points(board),
-        rotation,
-        camera_from_board[:3, 3],
-        np.array(camera.matrix),
-        np.array(camera.distortion),
-    )
+    lens = rotation, camera_from_board[:3, 3], np.array(camera.matrix), np.array(camera.distortion)
+    if camera.distortion_model == "equidistant":
+        pixels, _ = cv2.fisheye.projectPoints(board_points(board)[None], *lens)
+    else:
+        pixels, _ = cv2.projectPoints(board_points(board), *lens)
     return np.asarray(pixels.reshape(-1, 2))
 
 
@@ -89,14 +87,23 @@ def test_rows_of_the_board_along_the_pixel_rows_are_as_exact_as_others() -> None
     assert np.sqrt((np.concatenate(errors) ** 2).mean()) < 0.03
 
 
-@pytest.mark.parametrize("name", BOARDS)
-def test_every_board_is_detected_where_it_is(name: str) -> None:
+FISHEYE = CameraModel(
+    width=1280,
+    height=1024,
+    matrix=((1300.0, 0.0, 646.2), (0.0, 1300.0, 505.8), (0.0, 0.0, 1.0)),
+    distortion=(-0.03, 0.01, 0.0, 0.0),
+    distortion_model="equidistant",
+)
+
+
+@pytest.mark.parametrize(("name", "lens"), [*((name, CAMERA) for name in BOARDS), ("chessboard", FISHEYE)])
+def test_every_board_is_detected_where_it_is(name: str, lens: CameraModel) -> None:
     board = BOARDS[name]
     for view in varied_views(board, 2, seed=3):
-        picture = render(CAMERA, board, view, Light(pixel_noise=1.0), np.random.default_rng(2))
+        picture = render(lens, board, view, Light(pixel_noise=1.0), np.random.default_rng(2))
         seen = detect(picture, board)
         assert seen.found, seen.reason
-        truth = projected(board, view)
+        truth = projected(board, view, lens)
         # A grid that looks the same upside down may be read from its other end.
         orders = [truth, truth[::-1]] if 2 in looks_same_turns(board) else [truth]
         error = min((seen.pixels - points[seen.indices] for points in orders), key=np.linalg.norm)

@@ -124,6 +124,24 @@ def test_a_finished_session_is_solved_without_network_or_devices(machine: Machin
     shutil.rmtree(folder)
 
 
+def test_who_reads_calibrations_needs_no_right_to_move_the_arm(machine: Machine) -> None:
+    """As `calibrate install` of an operator leaves them, whose umask shares nothing."""
+    installs = (
+        "umask 077; cd /var/lib/station; mkdir calibrations/main; umask 027; echo 7 > calibrations/main/a"
+    )
+    machine.run(
+        "setpriv", "--reuid=station", "--regid=station-operator", "--clear-groups", "sh", "-c", installs
+    )
+
+    def as_reader(*command: str) -> str:
+        reader = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--groups=station-reader")
+        return machine.run(*reader, *command, check=False)
+
+    assert as_reader("cat", "/var/lib/station/calibrations/main/a") == "7\n"
+    assert not as_reader("ls", "/var/lib/station", "/var/lib/station/sessions")
+    machine.run("rm", "-r", "/var/lib/station/calibrations/main")
+
+
 def test_a_missing_configuration_is_said_once_and_not_started_again(machine: Machine) -> None:
     machine.drop_in("station.service", f"Environment=PYTHONPATH={CHECKOUT}")
     machine.run("systemctl", "start", "station", check=False)

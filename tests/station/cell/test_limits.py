@@ -123,16 +123,18 @@ def test_joint_range_and_step_name_the_joint():
     assert ("joint range", "base") in {(p.limit, p.of) for p in beyond}
 
 
-@pytest.mark.parametrize("bad", [[np.nan] * 6, [0.0] * 5, [np.inf, 0, 0, 0, 0, 0]])
-def test_joints_that_are_no_joints_are_a_problem_not_a_crash(bad):
+@pytest.mark.parametrize(
+    ("bad", "limits"),
+    [
+        ([np.nan] * 6, {"joints"}),
+        ([0.0] * 5, {"joints"}),
+        ([np.inf, 0, 0, 0, 0, 0], {"joints"}),
+        (np.rad2deg(REST) * 1e6, {"joint range", "joint step"}),  # at once: it is not sampled
+    ],
+)
+def test_joints_that_are_no_joints_are_a_problem_not_a_crash(bad, limits):
     move = check_path(FREE, REST, bad)
-    assert [p.limit for p in move.problems] == ["joints"]
-    assert move.joint_speed_rad_s == 0.0
-
-
-def test_degrees_in_place_of_radians_are_refused_at_once():
-    move = check_path(FREE, REST, np.rad2deg(REST) * 1e6)
-    assert {p.limit for p in move.problems} == {"joint range", "joint step"}
+    assert {p.limit for p in move.problems} == limits
     assert move.joint_speed_rad_s == 0.0
 
 

@@ -101,6 +101,8 @@ class PlanOptions:
     noise: MeasurementNoise = USUAL_NOISE
     free_intrinsics: bool = True
     """True: the intrinsics are estimated from the same images."""
+    view: ViewRange | None = None
+    """Range of views; None: chosen by lens and board size."""
     pool: int = POOL_SIZE
 
 
@@ -171,7 +173,7 @@ def candidate_pool(
 ) -> tuple[CandidateSet, list[str]]:
     """Find the candidates of the best branch, and notes. LimitError where the widest range has too few."""
     best: tuple[CandidateSet, CandidateSet, str] | None = None
-    for view, note in _relaxed(view_range(layout), _start_roll(layout, start)):
+    for view, note in _relaxed(options.view or view_range(layout), _start_roll(layout, start)):
         found = find_candidates(layout, view, 2 * options.pool, rng, start, _TRIES * options.pool)
         group = best_group(layout, found, start, options.pool, 3 * options.count)
         if best is None or len(group) > len(best[0]):

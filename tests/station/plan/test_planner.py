@@ -27,7 +27,7 @@ from station.cell.limits import check_plan
 from station.plan.candidates import NOT_IN_PICTURE, OUT_OF_REACH, find_candidates
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, make_plan, plan_layout
-from station.plan.visibility import lens_radius, view_range, visible
+from station.plan.visibility import ViewRange, lens_radius, view_range, visible
 from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 
@@ -222,7 +222,7 @@ def test_every_lens_model_can_be_planned_with(kind, distortion):
 
 def test_a_plan_without_a_start_and_with_few_poses():
     _, config = cell()
-    plan = plan_layout(layout_of(config), replace(FEW, count=4))
+    plan = plan_layout(layout_of(config), replace(FEW, count=4, view=replace(ViewRange(), doubt=1.0)))
     assert len(plan.poses) == 4
     assert check_plan(plan, None, cell_geometry(config)).problems == ()
 

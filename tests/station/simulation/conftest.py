@@ -1,8 +1,9 @@
-"""Robots without sockets."""
+"""Controllers as processes, robots without sockets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
@@ -11,6 +12,14 @@ from station.devices.rtde import RuntimeState
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
 from station.simulation.controller.uploads import UploadReader
+from station.simulation.launch import SimulatedController, start_controller
+
+
+@pytest.fixture
+def controller() -> Iterator[Callable[..., SimulatedController]]:
+    """Starts controllers: `controller("UR10", time_scale=…)`; all end with the test."""
+    with ExitStack() as ends:
+        yield lambda model="UR10", **options: ends.enter_context(start_controller(model, **options))
 
 
 class SteppedRobot:

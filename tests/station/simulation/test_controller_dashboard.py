@@ -36,14 +36,12 @@ def test_replies_of_the_dashboard(controller) -> None:
     assert dashboard(controller("UR10").host, *questions) == [GREETING, *questions.values()]
 
 
-def test_e_series_in_local_control_refuses_stop_and_answers_questions(controller) -> None:
+def test_e_series_in_local_control_refuses_stop_and_remote_control_frees_the_next_connection_only(
+    controller,
+) -> None:
     running = controller("UR10e", options=("--local",))
     replies = dashboard(running.host, "is in remote control", "PolyscopeVersion", "stop")
     assert replies[1] == "false" and "5.11.1.108318" in replies[2] and replies[3] == LOCAL_REFUSAL
-
-
-def test_remote_control_frees_the_next_connection_only(controller) -> None:
-    running = controller("UR10e", options=("--local",))
     with (
         socket.create_connection((running.host, 29999), 3) as link,
         link.makefile("rw", newline="\n") as lines,

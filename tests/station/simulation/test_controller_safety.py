@@ -1,4 +1,4 @@
-"""Safety states, programs that are ignored, pause, hands and scaled time, inside the controller."""
+"""Safety states, programs that are ignored, pause and hands, inside the controller."""
 
 from __future__ import annotations
 
@@ -83,13 +83,3 @@ def test_hands_move_the_arm_only_when_it_is_free(started) -> None:
     made.robot.play_program()
     made.run(1.0)
     assert made.robot.arm.command == GOAL, "the motion that was under way is lost"
-
-
-def test_time_scale_speeds_up_motion_and_nothing_else(started) -> None:
-    """Faster motion, same clock, and speeds as commanded."""
-    fast = started("  movej([2.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0], a=2.0, v=0.5)", time_scale=4.0)
-    fast.run(0.5)
-    assert fast.robot.outputs.vector("target_qd")[0] == pytest.approx(0.5, rel=0.01)
-    took = 0.5 + fast.run_until(lambda: not fast.robot.arm.moving)
-    assert took == pytest.approx((2.0 / 0.5 + 0.5 / 2.0) / 4, abs=0.03)
-    assert fast.robot.time_s == pytest.approx(fast.robot.ticks / 125)

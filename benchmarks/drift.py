@@ -97,7 +97,7 @@ def measure(task: tuple[str, Mount, float, int]) -> tuple[float, ...]:
         views = [later_views(cell, moved * k / (CHECKS - 1), 100 * seed + k, VIEWS) for k in range(CHECKS)]
         checks = [find_shift(each, known) for each in views]
         entries = [entry_of(check, 604800.0 * k, 1, "") for k, check in enumerate(checks)]
-        trends.append(float(find_trend(entries, 1, known) is not None))
+        trends.append(float(find_trend(entries, known) is not None))
         found.append((checks[-1], find_shift(without_joints(views[-1]), known)))
     with_joints, without = (
         (float(not still.passed), float(not creep.passed), still.power_translation)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_from_turned, board_points, looks_same_turns
@@ -22,7 +23,7 @@ from calibrate.projection import project_pixels
 from calibrate.recorded_views import Progress, load_views
 from calibrate.views import board_in_camera
 from recordings.reader import Recording
-from recordings.schema.messages import CameraModel, Image, Matrix4
+from recordings.schema.messages import Image, Matrix4
 from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter, derived_recording
 
@@ -58,13 +59,11 @@ def annotate(
         raise CalibrationError("not-of-recording", calibrated=calibration.mount, recorded=info.mount)
     seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
     rejected = {view.index: view.reason for view in calibration.views.rejected}
-    X, B = calibration.transform.matrix, calibration.board_place.transform.matrix
     marks: list[list[Marks]] = []
     found: list[ViewResidual] = []
     for view in recording.views():
         why = rejected.get(view.index, "")
-        C = board_in_camera(info.mount, np.array(view.base_from_flange), X, B)
-        of_view, rms_px = _marks(calibration, camera, C, seen.get(view.index), bool(why))
+        of_view, rms_px = _marks(calibration, view.base_from_flange, seen.get(view.index), bool(why))
         marks.append(of_view)
         found.append(ViewResidual(view.index, rms_px, why))
     with derived_recording(output, msgspec.structs.replace(info, part=1)) as writer:
@@ -101,24 +100,32 @@ def _copied(recording: Recording, writer: RecordingWriter) -> Iterator[Image]:
         yield image
 
 
+def placed_corners(calibration: Calibration, base_from_flange: ArrayLike, seen: Detection) -> Array:
+    """Predict the corners seen (k, 2), px, by robot pose, camera pose and board pose; NaN behind the camera.
+
+    A board that looks the same turned is turned as it fits best.
+    """
+    board, X = calibration.board, calibration.transform.matrix
+    B = calibration.board_place.transform.matrix
+    placed = board_in_camera(calibration.mount, np.asarray(base_from_flange, float), X, B)
+    turns = [placed @ board_from_turned(board, quarters) for quarters in (0, *looks_same_turns(board))]
+    points = board_points(board)[seen.indices]
+    at = [project_pixels(calibration.intrinsics.model, points @ T[:3, :3].T + T[:3, 3]) for T in turns]
+    return min(at, key=lambda pixels: float(np.nan_to_num(np.square(pixels - seen.pixels), nan=np.inf).sum()))
+
+
 def _marks(
-    calibration: Calibration, camera: CameraModel, camera_from_board: Array, seen: Detection | None, bad: bool
+    calibration: Calibration, base_from_flange: ArrayLike, seen: Detection | None, bad: bool
 ) -> tuple[list[Marks], float | None]:
     """Draw corners, and from each a magnified line towards where it is predicted; return the rms, too."""
     if seen is None or not seen.found:
         return [], None
-    best: Array | None = None
-    for quarters in (0, *looks_same_turns(calibration.board)):  # a board that looks the same turned
-        turned = camera_from_board @ board_from_turned(calibration.board, quarters)
-        points = board_points(calibration.board)[seen.indices] @ turned[:3, :3].T + turned[:3, 3]
-        off = project_pixels(camera, points) - seen.pixels
-        if np.isfinite(off).all() and (best is None or (off**2).sum() < (best**2).sum()):
-            best = off
+    off = placed_corners(calibration, base_from_flange, seen) - seen.pixels
     corners = Marks(seen.pixels, REJECTED if bad else USED, thickness_px=5.0)
-    if best is None:
+    if not np.isfinite(off).all():
         return [corners], None
-    towards = Marks(seen.pixels, PREDICTED, seen.pixels + MAGNIFIED * best, thickness_px=3.0)
-    return [corners, towards], float(np.sqrt((best**2).sum(axis=1).mean()))
+    towards = Marks(seen.pixels, PREDICTED, seen.pixels + MAGNIFIED * off, thickness_px=3.0)
+    return [corners, towards], float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
 def _text(view: ViewResidual) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import sys
 from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -127,8 +130,21 @@ def _held_out(missed_m: Array) -> HeldOutViews:
 
 
 def solver_software() -> dict[str, str]:
-    """Machine, Python and the packages that a result depends on."""
-    return {**software_versions(*_PACKAGES), "machine": f"{sys.platform} {platform.machine()}"}
+    """Machine, Python and the packages that a result depends on; of a changed checkout the source too."""
+    return {
+        **software_versions(*_PACKAGES),
+        "source": _source_sha256()[:12],
+        "machine": f"{sys.platform} {platform.machine()}",
+    }
+
+
+@cache
+def _source_sha256() -> str:
+    """Hash the modules that make a result: in a checkout they change without the version."""
+    digest, root = hashlib.sha256(), Path(__file__).parents[1]
+    for path in sorted(root.glob("calibrate/**/*.py")) + sorted(root.glob("recordings/**/*.py")):
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> Lens:

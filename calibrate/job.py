@@ -30,7 +30,7 @@ from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
 from calibrate.projection import intrinsics_names
-from calibrate.recorded_views import LoadedViews, Progress, load_views, without_views
+from calibrate.recorded_views import LoadedViews, Progress, load_views
 from calibrate.solved import Solved
 from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording
@@ -128,9 +128,7 @@ def prepare_views(
         recorded = recording.info.camera
         camera = CameraModel(recorded.width, recorded.height)
     board = _board(options, recording.info.board)
-    loaded = load_views(recording, board, camera, progress, options.threads, fewest)
-    if options.without:
-        loaded = without_views(loaded, options.without, fewest)
+    loaded = load_views(recording, board, camera, progress, options.threads, fewest, options.without)
     views, intrinsics = with_board_poses(loaded.views, loaded.board, options.lens_model)
     return PreparedViews(recording, loaded, views, intrinsics)
 

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:  # that module needs SciPy
-    from calibrate.geometry import Array
+from calibrate.geometry import Array, rotation_exp
 
 _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 JOINT_NAMES = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
@@ -25,7 +24,7 @@ URDF_ORIGIN = ("x", "y", "z", "roll", "pitch", "yaw")
 """Keys of the kinematics file of ROS 2's UR driver."""
 
 
-_NONE = (0.0,) * 6
+COLUMNS = ("a_m", "d_m", "alpha_rad", "theta_rad", "beta_rad")
 
 
 @dataclass(frozen=True)
@@ -43,27 +42,17 @@ class RobotModel:
     link_radius_m: tuple[float, ...] = field(default=(0.09, 0.075, 0.06, 0.05, 0.05, 0.045))
     """Rough capsule radii of the links, for clearance; generous."""
 
-    def calibrated(
-        self,
-        a_m: Sequence[float] = _NONE,
-        d_m: Sequence[float] = _NONE,
-        alpha_rad: Sequence[float] = _NONE,
-        theta_rad: Sequence[float] = _NONE,
-        beta_rad: Sequence[float] = _NONE,
-    ) -> RobotModel:
-        """Add factory or estimated corrections (6,) each; the analytic inverse stays the nominal table's."""
+    def calibrated(self, *columns: Sequence[float], **named: Sequence[float]) -> RobotModel:
+        """Add factory or estimated corrections (6,) to `COLUMNS`, in their order or by name.
 
-        def add(nominal: Sequence[float], delta: Sequence[float]) -> tuple[float, ...]:
-            return tuple(n + d for n, d in zip(nominal, delta, strict=True))
-
-        return replace(
-            self,
-            a_m=add(self.a_m, a_m),
-            d_m=add(self.d_m, d_m),
-            alpha_rad=add(self.alpha_rad, alpha_rad),
-            theta_rad=add(self.theta_rad, theta_rad),
-            beta_rad=add(self.beta_rad, beta_rad),
-        )
+        The analytic inverse stays the nominal table's.
+        """
+        corrections = dict(zip(COLUMNS, columns, strict=False)) | named
+        changed: dict[str, Any] = {
+            name: tuple(n + d for n, d in zip(getattr(self, name), delta, strict=True))
+            for name, delta in corrections.items()
+        }
+        return replace(self, **changed)
 
 
 def _model(name: str, a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> RobotModel:
@@ -146,7 +135,7 @@ def table_of_axes(like: RobotModel, direction: Array, point: Array, flange: Arra
             across = at - a * towards  # its part along the next axis and z
             d = across[2] - axis[2] * (across[:2] @ axis[:2]) / (axis[:2] @ axis[:2])
         theta = np.arctan2(towards[1], towards[0])
-        turned = _turn_z(theta).T @ axis
+        turned = rotation_exp([0.0, 0.0, theta]).T @ axis
         beta = np.arcsin(turned[0]) if i in _PARALLEL else 0.0
         alpha = np.arctan2(-turned[1], turned[2])
         columns[:, i] = a, d, alpha, theta, beta
@@ -168,13 +157,8 @@ _ON_AXIS = 1e-6
 
 
 def _with_columns(like: RobotModel, columns: Array) -> RobotModel:
-    a, d, alpha, theta, beta = (tuple(column) for column in columns.tolist())
-    return replace(like, a_m=a, d_m=d, alpha_rad=alpha, theta_rad=theta, beta_rad=beta)
-
-
-def _turn_z(angle: float) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    changed: dict[str, Any] = dict(zip(COLUMNS, map(tuple, columns.tolist()), strict=True))
+    return replace(like, **changed)
 
 
 def forward(model: RobotModel, joints_rad: ArrayLike) -> Array:

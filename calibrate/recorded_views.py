@@ -59,23 +59,36 @@ def load_views(
     progress: Progress | None = None,
     threads: int | None = None,
     fewest: int = FEWEST_TO_SOLVE,
+    without: tuple[int, ...] = (),
 ) -> LoadedViews:
     """Find the board in every image of the recording.
 
-    `board` and `camera` replace the recorded ones (another size, known intrinsics). The result does not
-    depend on the number of `threads`, as long as OpenCV itself uses one thread in each. Raises
-    BadViewsError for pictures or poses that cannot be, TooFewViewsError when fewer than `fewest` show it. A
-    picture that cannot be decoded costs its own pose only.
+    `board` and `camera` replace the recorded ones (another size, known intrinsics). `without`: numbers, from
+    1, of the poses that a person excludes; they are listed as rejected. The result does not depend on the
+    number of `threads`, as long as OpenCV itself uses one thread in each. Raises BadViewsError for pictures
+    or poses that cannot be and a number that no pose has, TooFewViewsError when fewer than `fewest` show it.
+    A picture that cannot be decoded costs its own pose only.
     """
-    info = recording.info
+    info, recorded = recording.info, recording.views()
+    if unknown := set(without) - {view.index + 1 for view in recorded}:
+        raise BadViewsError(
+            "no-such-view",
+            told=", ".join(map(str, sorted(unknown))),
+            views=max((view.index + 1 for view in recorded), default=0),
+        )
+    missing = [
+        RejectedView(view.index, view.name, "excluded (--without)", "by-hand")
+        for view in recorded
+        if view.index + 1 in without
+    ]
+    recorded = [view for view in recorded if view.index + 1 not in without]
     spec = board or info.board
     if spec.kind is BoardKind.UNSEEN:
-        return _told_views(recording, fewest)
+        return _told_views(recording, recorded, missing, fewest)
     model = camera or info.camera
     views: list[BoardView] = []
-    missing: list[RejectedView] = []
     seen: dict[int, Detection] = {}
-    for view, detection in detect_all(recording, recording.views(), spec, model, progress, threads):
+    for view, detection in detect_all(recording, recorded, spec, model, progress, threads):
         if isinstance(detection, BadImageError):
             missing.append(RejectedView(view.index, view.name, str(detection), "unreadable-picture"))
             continue
@@ -96,15 +109,17 @@ def load_views(
     return LoadedViews(found, spec, tuple(missing), seen, recording.losses)
 
 
-def _told_views(recording: Recording, fewest: int) -> LoadedViews:
+def _told_views(
+    recording: Recording, views: list[View], missing: list[RejectedView], fewest: int
+) -> LoadedViews:
     """Take the views of a recording without pictures, in which the board's poses were told."""
     info = recording.info
-    told = [view for view in recording.views() if view.camera_from_board is not None]
+    told = [view for view in views if view.camera_from_board is not None]
     if len(told) < fewest:
-        raise _too_few(recording, info.board, len(told), {}, [], fewest)
+        raise _too_few(recording, info.board, len(told), {}, missing, fewest)
     poses = np.array([(view.base_from_flange, view.camera_from_board) for view in told], dtype=float)
     found = ViewSet.from_poses(info.mount, poses[:, 0], poses[:, 1])
-    views = tuple(
+    own = tuple(
         replace(
             one,
             index=view.index,
@@ -113,8 +128,8 @@ def _told_views(recording: Recording, fewest: int) -> LoadedViews:
         )
         for one, view in zip(found, told, strict=True)
     )
-    found = replace(found, views=views, robot_model=info.robot.model, arm=_calibrated_arm(recording))
-    return LoadedViews(found, info.board, (), losses=recording.losses)
+    found = replace(found, views=own, robot_model=info.robot.model, arm=_calibrated_arm(recording))
+    return LoadedViews(found, info.board, tuple(missing), losses=recording.losses)
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:
@@ -157,38 +172,6 @@ def arm_of_ros(content: bytes, robot: str) -> RobotModel:
         raise ValueError(f"not as ur_calibration writes it: {problem!r}") from None
     frames = np.array(chain)
     return table_of_axes(MODELS[robot], frames[1:, :3, 2], frames[1:, :3, 3], frames[6])
-
-
-def without_views(
-    loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_TO_SOLVE
-) -> LoadedViews:
-    """Exclude the poses of these numbers (from 1), which a person chose; they are listed as rejected.
-
-    A pose whose picture shows no board is left out already. Raises BadViewsError for a number that no pose
-    has, TooFewViewsError when fewer than `fewest` stay.
-    """
-    chosen = {number - 1 for number in numbers}
-    views = loaded.views
-    if unknown := chosen - {view.index for view in (*views, *loaded.without_board)}:
-        raise BadViewsError(
-            "no-such-view",
-            told=", ".join(str(index + 1) for index in sorted(unknown)),
-            views=max(view.index for view in loaded.views) + 1,
-        )
-    left = tuple(
-        RejectedView(view.index, view.name, "excluded (--without)", "by-hand")
-        for view in views
-        if view.index in chosen
-    )
-    if len(views) - len(left) < fewest:
-        raise TooFewViewsError(
-            counted=f"--without leaves {len(views) - len(left)} of {len(views)} views",
-            views=len(views) - len(left),
-            needed=fewest,
-            advice="Leave out fewer.",
-        )
-    kept = views.select([place for place, view in enumerate(views) if view.index not in chosen])
-    return replace(loaded, views=kept, without_board=(*loaded.without_board, *left))
 
 
 def detect_all(

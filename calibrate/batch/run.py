@@ -105,11 +105,11 @@ def batch_key(recording: Path, options: JobOptions) -> str:
 
     Of a session folder with size and date of each file in it.
     """
-    found: list[tuple[bytes, int, int]] = []
+    found: list[tuple[bytes, int, int]] = [(os.fsencode(os.path.realpath(recording)), 0, 0)]
     with suppress(OSError):
         for file in sorted(recording.iterdir()) if recording.is_dir() else [recording]:
             stat = file.stat()
-            found.append((os.fsencode(os.path.realpath(file)), stat.st_size, stat.st_mtime_ns))
+            found.append((os.fsencode(file.name), stat.st_size, stat.st_mtime_ns))
     chosen = {name: msgspec.to_builtins(value) for name, value in vars(options).items() if name != "threads"}
     parts = [found, chosen, solver_software()]
     return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()[:24]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
@@ -51,18 +53,24 @@ class CheckEntry(msgspec.Struct, frozen=True, omit_defaults=True):
 
 def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN_CAMERA) -> None:
     """Append a drift check to the history. Raises InstallError when the state folder cannot be written."""
-    folder = calibrations_folder(root, camera)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        append_line(folder / FILE, entry)
-    except OSError as problem:
-        why = f"the drift check cannot be logged ({problem.strerror})"
-        raise InstallError("state-folder", path=folder, why=why) from None
+    with _history(root, camera) as path:
+        append_line(path, entry)
 
 
 def read_checks(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
-    """Read the history of drift checks, oldest first; empty when there is none."""
-    return read_lines(calibrations_folder(root, camera) / FILE, CheckEntry)
+    """Read the history of drift checks, oldest first; empty when there is none. Raises InstallError."""
+    with _history(root, camera) as path:
+        return read_lines(path, CheckEntry)
+
+
+@contextmanager
+def _history(root: Path | None, camera: str) -> Iterator[Path]:
+    path = calibrations_folder(root, camera) / FILE
+    try:
+        yield path
+    except OSError as problem:
+        why = f"no drift check can be logged there ({problem.strerror})"
+        raise InstallError("state-folder", path=path, why=why) from None
 
 
 def _duration(days: float) -> str:

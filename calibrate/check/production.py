@@ -131,6 +131,6 @@ class EarlierPictures:
 
 def check_production(views: ViewSet, known: KnownCell) -> DriftCheck:
     """Test the newest of all pictures, oldest first, against those before. Raises as `EarlierPictures.of`."""
-    known, newest = known.beside(views), min(NEWEST[-1], len(views) - EARLIER)
-    earlier = replace(views, views=views.views[: len(views) - newest][-MOST_EARLIER:])
-    return EarlierPictures.of(earlier, known).test(replace(views, views=views.views[len(views) - newest :]))
+    known, newest = known.beside(views), min(NEWEST[-1], max(NEWEST[0], len(views) - EARLIER))
+    earlier = replace(views, views=views.views[:-newest][-MOST_EARLIER:])
+    return EarlierPictures.of(earlier, known).test(replace(views, views=views.views[-newest:]))

@@ -1,4 +1,4 @@
-"""The trend of the drift checks of one installed version: the camera moves along a straight line in time."""
+"""The trend of the drift checks of one solve: the camera moves along a straight line in time."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ def _evidence(entry: CheckEntry) -> Quadratic:
 
 
 def find_trend(
-    history: Sequence[CheckEntry], generation: int, known: KnownCell, board: BoardSpec | None = None
+    checks: Sequence[CheckEntry], known: KnownCell, board: BoardSpec | None = None
 ) -> Trend | None:
-    """Look for a trend in the checks of this installed version and one board; None where chance explains it.
+    """Look for a trend in those checks of one solve that saw one board; None where chance explains it.
 
     board: the calibration's own where None; `known` is what is known before its views. The checks are solved
     together: lens, board and arm are the same in all, the camera's pose moves along a straight line of six
     slopes. These are tested at 1 % like the shift of one check, as all have the calibration's noise.
     """
     size = len(known.covariance)
-    entries = [e for e in history if e.generation == generation and e.board == board and len(e.right) == size]
+    entries = [entry for entry in checks if entry.board == board and len(entry.right) == size]
     if len(entries) < FEWEST_FOR_TREND:
         return None
     days = np.array([entry.wall_s for entry in entries]) / 86400

@@ -63,7 +63,7 @@ class ListedJson(msgspec.Struct, frozen=True):
     created: str | None
     source: str | None
     sigma: Sigma | None
-    validity: Validity | None
+    validity: Validity
 
 
 class InstalledJson(msgspec.Struct, frozen=True):
@@ -72,7 +72,7 @@ class InstalledJson(msgspec.Struct, frozen=True):
     generation: int
     path: str
     current: str
-    validity: Validity | None
+    validity: Validity
 
 
 class DriftCheckJson(DriftFigures, frozen=True, kw_only=True, eq=False):

@@ -19,13 +19,14 @@ from calibrate.check.trend import entry_of, find_trend
 from calibrate.cli.contracts import DriftCheckJson
 from calibrate.cli.files import read_board
 from calibrate.cli.installed import Root, named_or_installed
-from calibrate.cli.output import AsJson, detection_progress, out, print_json
+from calibrate.cli.output import AsJson, detection_progress, err, out, print_json
 from calibrate.cli.solve_options import BoardFile
-from calibrate.errors import BadViewsError
+from calibrate.errors import CalibrationError, InstallError
 from calibrate.files.calibration import Calibration, Provenance
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
 from calibrate.files.validity import Validity, ValidityReason, validity_text
+from calibrate.files.versions import installed_versions, same_solve
 from calibrate.job import JobOptions, PreparedViews, prepare_views
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.importers.dataset import DATASET_FILE
@@ -85,20 +86,25 @@ def drift_check(
             recording, options, progress, fewest=1 if production else FEWEST_FOR_DRIFT_CHECK
         )
     info, noted = prepared.recording.info, None if held is None else _Noted(root, camera, held.version)
-    own, trend, validity, before = False, None, None, list[bool]()
+    own, trend, validity, before, unnoted = False, None, None, list[bool](), None
     if production:
         result = _check_pictures(source, prepared, calibration)
         text = production_text(result, len(prepared.views))
-        if noted is not None and not result.passed:  # no alarm is no proof
-            validity = _judge(noted, result, source.name, datetime.now(UTC))
     else:
         _require_this_cell(source, info, calibration, root, noted)
         result = check_drift(prepared.views, calibration, prepared.loaded.board)
         text = check_text(result, calibration)
         own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
-        if noted is not None and not own:
-            before, trend = _log(noted, result, calibration, info, prepared.loaded.board)
+    try:
+        if noted is not None and production and not result.passed:  # no alarm is no proof
+            validity = _judge(noted, result, source.name, datetime.now(UTC))
+        elif noted is not None and not production and not own:
             validity = _judge(noted, result, info.name, _taken(info))
+            before, trend = _log(noted, result, calibration, info, prepared.loaded.board)
+    except InstallError as problem:
+        if problem.code == "other-version":
+            raise
+        unnoted = problem  # what a full disk cannot keep is told all the same
     proves_nothing = own and result.passed
     if as_json:
         said = {"passed": result.passed and not own, "own_views": own, "validity": validity}
@@ -115,10 +121,12 @@ def drift_check(
         if validity is not None:
             style = VALIDITY_STYLES[validity.state]
             out.print(f"The installed calibration is {validity_text(validity)}", style=style)
+    if unnoted is not None:
+        err.print(f"Not noted for other programs. {unnoted}", style="bold red", soft_wrap=True)
     if not result.passed:
         raise typer.Exit(DRIFTED)
-    if proves_nothing:
-        raise typer.Exit(BadViewsError.exit_code)
+    if proves_nothing or unnoted is not None:
+        raise typer.Exit(CalibrationError.exit_code)
 
 
 class _Noted(NamedTuple):
@@ -152,13 +160,18 @@ def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibrat
 def _log(
     noted: _Noted, result: DriftCheck, calibration: Calibration, info: SessionInfo, looked_at: BoardSpec
 ) -> tuple[list[bool], Trend | None]:
-    """Log the check: results of the earlier ones of the installed calibration, and the trend with it."""
-    before = read_checks(noted.root, noted.camera)
+    """Log the check: results of the earlier ones of the same solve, and the trend with it.
+
+    A touch test makes a version of the same solve.
+    """
+    versions = installed_versions(noted.root, noted.camera)
+    solve = {version.number for version in versions if same_solve(calibration, version.calibration)}
+    before = [entry for entry in read_checks(noted.root, noted.camera) if entry.generation in solve]
     board = None if looked_at == calibration.board else looked_at
     entry = entry_of(result, _taken(info).timestamp(), noted.version, info.name, board)
-    trend = find_trend([*before, entry], noted.version, known_cell(calibration, board), board)
+    trend = find_trend([*before, entry], known_cell(calibration, board), board)
     append_check(msgspec.structs.replace(entry, trend=trend), noted.root, noted.camera)
-    return [one.passed for one in before if one.generation == noted.version], trend
+    return [one.passed for one in before], trend
 
 
 def _taken(info: SessionInfo) -> datetime:

@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from calibrate.cli.installed import CameraName, Root
-from calibrate.files.calibration import FramePose, Lens, source_stamp
+from calibrate.files.calibration import SOURCE_STAMPS, FramePose, Lens
 from calibrate.files.loader import InstallationChange, watch
 from calibrate.files.validity import Validity, validity_text
 from recordings.files import MAIN_CAMERA
@@ -56,7 +56,7 @@ def _followed(change: InstallationChange, camera: str) -> Followed:
     found = change.installed
     if found is None:
         return Followed(change.event, camera, str(change.problem))
-    said = ". ".join(filter(None, (source_stamp(found.source), validity_text(found.validity))))
+    said = ". ".join(filter(None, (SOURCE_STAMPS[found.source], validity_text(found.validity))))
     result, lens = msgspec.convert((found.plain["result"], found.plain["intrinsics"]), tuple[FramePose, Lens])
     return Followed(
         change.event, camera, said, found.version, found.source, found.mount, found.validity, result, lens

@@ -192,8 +192,7 @@ def _switched(version: InstalledVersion, as_json: bool) -> None:
     out.print(f"Installed: version {version.number}, {stable}", soft_wrap=True)
     if version.change:
         out.print(f"Change: {version.change}")
-    if version.validity is not None:
-        out.print(f"Validity: {validity_text(version.validity)}")
+    out.print(f"Validity: {validity_text(version.validity)}")
 
 
 def list_installed(
@@ -226,8 +225,8 @@ def _lines(version: InstalledVersion) -> list[str]:
     if calibration is None:
         return [version.problem]
     made = f"{calibration.provenance.session}, solved {calibration.created}"
-    told = version.current or (validity is not None and validity.state in _TOLD_OF_OLD)
-    held = [validity_text(validity)] if validity is not None and told else []
+    told = version.current or validity.state in _TOLD_OF_OLD
+    held = [validity_text(validity)] if told else []
     override = "" if calibration.override is None else f"; {override_text(calibration.override)}"
     return [made, pose_text(calibration), verdict_text(calibration) + override, *held]
 

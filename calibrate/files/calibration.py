@@ -46,11 +46,13 @@ from recordings.schema.messages import (
     WallTime,
 )
 
-_STAMPS = {
+SOURCE_STAMPS: dict[Source, str] = {
+    "real": "",
     "simulated": "SIMULATED: made without a robot or a camera",
     "playback": "PLAYBACK: the images were played back",
     "imported": "IMPORTED: images and poses of unknown origin",
 }
+"""Warning to show with a calibration of no real cell."""
 
 FORMAT: Literal["handeye-calibration/2"] = "handeye-calibration/2"
 Vector3 = tuple[float, float, float]
@@ -418,8 +420,3 @@ def write_output(path: Path, content: bytes) -> None:
         raise CalibrationFileError(
             path=path, why=f"cannot be written: {problem.strerror or problem}"
         ) from None
-
-
-def source_stamp(source: Source) -> str:
-    """Warning to show with a simulated, played-back or imported calibration; empty for a real one."""
-    return _STAMPS.get(source, "")

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import Calibration, Override, source_stamp
+from calibrate.files.calibration import SOURCE_STAMPS, Calibration, Override
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.geometry import roll_pitch_yaw
@@ -115,8 +115,8 @@ def summary(calibration: Calibration, validity: Validity | None = None) -> Rende
     if validity is not None:
         shown = f"Installed: {validity_text(validity)}"
         parts.append(Text(shown, style=VALIDITY_STYLES[validity.state]))
-    if source_stamp(calibration.source):
-        parts.append(Text(source_stamp(calibration.source), style="bold yellow"))
+    if SOURCE_STAMPS[calibration.source]:
+        parts.append(Text(SOURCE_STAMPS[calibration.source], style="bold yellow"))
     if calibration.override is not None:
         parts.append(Text(override_text(calibration.override), style="bold yellow"))
     parts += [_result_table(calibration), _gate_table(calibration)]

@@ -31,7 +31,6 @@ from calibrate.files.validity import (
     ValidityReason,
     ValidityState,
     time_text,
-    unrecorded,
 )
 from calibrate.files.versions import (
     InstalledVersion,
@@ -79,8 +78,6 @@ def install(
     cell: Cell = "real",
     camera: str = "",
     override: str = "",
-    robot_serial: str = "",
-    camera_serial: str = "",
     max_age_days: float | None = None,
 ) -> InstalledVersion:
     """Make the calibration file `path` the current one of its camera.
@@ -88,18 +85,18 @@ def install(
     `cell`: kind of cell that this root belongs to; a real one refuses what is simulated, played back or
     imported, whatever the override. `camera`: its name in the cell; empty: as in the file.
     `override`: a person's reason to install although a gate failed or robot or camera differ; it goes into
-    the file. `robot_serial`, `camera_serial`: of the cell's own configuration, when known. `max_age_days`:
-    age of the last proof from which it is in doubt; None: the rule of the one before, 0: no rule.
+    the file. `max_age_days`: age of the last proof from which it is in doubt; None: the rule of the one
+    before, 0: no rule.
 
     Raises InstallError (also as exit code 4 for a gate) or CalibrationFileError.
     """
     require_choice("cell", cell, get_args(Cell))
     require_positive(max_age_days=max_age_days or None)  # 0: no limit
     calibration = read_calibration(path)
-    camera = camera or calibration.camera_name
-    folder = calibrations_folder(root, camera)
+    name = camera or calibration.camera_name
+    folder = calibrations_folder(root, name)
     with locked(folder):
-        before, damaged = _installed_before(root, camera)
+        before, objections, worse = _beside(calibration, root, name)
         kinds = {cell} if before is None else {cell, _CELL_OF[before.source]}
         if other := kinds - {_CELL_OF[calibration.source]}:
             raise InstallError(
@@ -107,14 +104,9 @@ def install(
                 path=path,
                 source=calibration.source,
                 cell=other.pop(),
-                command=install_line(calibration.source, path),
+                command=install_line(calibration.source, path, camera=camera),
             )
-        objections = [*damaged, *_objections(calibration, before, robot_serial, camera_serial)]
-        if calibration.camera.name and calibration.camera.name != camera:
-            objections.append(f"It is of the camera named {calibration.camera.name}, not {camera}.")
-        objections += [f"Touch test, {touch_text(t)}." for t in calibration.verification if not agrees(t)]
-        gates = [*calibration.quality.failed, *_regression(calibration, before)]
-        failed = [f"{gate.name}: {gate.text}" for gate in gates]
+        failed = [f"{gate.name}: {gate.text}" for gate in (*calibration.quality.failed, *worse)]
         overridden = [*objections, *failed]
         if overridden and not override.strip():
             kind = InstallError if objections else GateFailedError
@@ -122,7 +114,7 @@ def install(
                 "objection" if objections else "gate-failed",
                 path=path,
                 why=" ".join(overridden),
-                command=install_line(calibration.source, path, root, "REASON"),
+                command=install_line(calibration.source, path, root, "REASON", camera),
                 gates=len(failed),
                 objections=len(objections),
             )
@@ -187,7 +179,7 @@ def rollback(
         before = next((g.calibration for g in known if g.current), None)
         change = change_text(before, target.calibration)
         validity = _validity_again(target, _max_age_days(folder, None))
-        return make_current(folder, target, "rollback", validity, change, reason)
+        return make_current(folder, replace(target, validity=validity), "rollback", change, reason)
 
 
 def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Validity:
@@ -215,7 +207,7 @@ def _where(root: Path | None, camera: str) -> list[str]:
 
 def _validity_again(target: InstalledVersion, max_age_days: float | None) -> Validity:
     """Choose the validity of a version after a rollback: it was not checked while it was not current."""
-    was = replace(target.validity or unrecorded(target.number), max_age_days=max_age_days)
+    was = replace(target.validity, max_age_days=max_age_days)
     if was.state is ValidityState.IN_DOUBT or target.current:
         return was
     reason = ValidityReason("rolled-back", "Rolled back to. Run a drift check.")
@@ -292,10 +284,9 @@ def _require_words(reason: str) -> None:
 
 
 def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
-    """List objections against replacing the installed one: other robot, camera, mounting, or larger error."""
-    before, damaged = _installed_before(root, calibration.camera_name)
-    worse = [gate.text for gate in _regression(calibration, before)]
-    return [*damaged, *_objections(calibration, before, "", ""), *worse]
+    """List what installing asks a reason for, besides failed gates, as `_beside` finds it."""
+    _, objections, worse = _beside(calibration, root, calibration.camera_name)
+    return [*objections, *(gate.text for gate in worse)]
 
 
 def change_text(before: Calibration | None, after: Calibration) -> str:
@@ -312,24 +303,45 @@ def change_text(before: Calibration | None, after: Calibration) -> str:
     return f"{millimetres:.3f} mm, {degrees:.4f}° ({sigmas:.1f}σ) from the one before"
 
 
-def _installed_before(root: Path | None, camera: str) -> tuple[Calibration | None, list[str]]:
-    """Read the current calibration, or the newest undamaged one, to compare a new one with; else None.
+def _beside(
+    calibration: Calibration, root: Path | None, camera: str
+) -> tuple[Calibration | None, list[str], list[Gate]]:
+    """Compare a calibration with the installed one, or the newest undamaged one.
 
-    Also the objection that the current one is damaged.
+    That one, objections (another robot, camera or mounting, a missed touch test), and a failed gate where it
+    is much less certain.
     """
     known = [g for g in installed_versions(root, camera) if g.calibration is not None]
     current = [g for g in known if g.current]
-    damaged = not current and (calibrations_folder(root, camera) / "current").is_symlink()
-    text = "The installed one is damaged: this one was not compared with it."
-    return (current or known)[-1].calibration if known else None, [text] if damaged else []
+    before = (current or known)[-1].calibration if known else None
+    found = []
+    if not current and (calibrations_folder(root, camera) / "current").is_symlink():
+        found.append("The installed one is damaged: this one was not compared with it.")
+    if before is not None:
+        for name in ("robot", "camera"):
+            ours, theirs = getattr(calibration, name), getattr(before, name)
+            if (ours.model, ours.serial) != (theirs.model, theirs.serial):
+                installed = f"the installed one of {theirs.model} {theirs.serial}."
+                found.append(f"It is of {name} {ours.model} {ours.serial}, {installed}")
+        if before.mount != calibration.mount:
+            found.append(f"It is {calibration.mount}, the installed one {before.mount}.")
+    if not calibration.intrinsics.matrix:
+        found.append("It was made without pictures: no gate judged them, and the lens is not known.")
+    if calibration.camera.name not in ("", camera):
+        found.append(f"It is of the camera named {calibration.camera.name}, not {camera}.")
+    found += [f"Touch test, {touch_text(t)}." for t in calibration.verification if not agrees(t)]
+    return before, found, _regression(calibration, before)
 
 
-def install_line(source: Source, path: Path, root: Path | None = None, override: str = "") -> str:
+def install_line(
+    source: Source, path: Path, root: Path | None = None, override: str = "", camera: str = ""
+) -> str:
     """Make the command that installs a file of this source; only real ones go to the default root."""
     kind = _CELL_OF[source]
     words = ["calibrate", "install"]
     words += [] if kind == "real" else ["--cell", kind]
     words += [] if kind == "real" and root is None else ["--root", str(root or "ROOT")]
+    words += ["--camera", camera] if camera else []
     words += ["--override", override] if override else []
     return shlex.join([*words, str(path)])
 
@@ -352,25 +364,3 @@ def _regression(calibration: Calibration, before: Calibration | None) -> list[Ga
         remedy += " Its error was stated by another version: solve its recording again to compare."
     gate = Gate.measured("no_worse", title, ours, "≤", WORSE_TIMES * theirs, "m", remedy)
     return [] if gate.passed else [gate]
-
-
-def _objections(
-    calibration: Calibration, before: Calibration | None, robot_serial: str, camera_serial: str
-) -> list[str]:
-    """List objections other than gates: another robot, camera or mounting than the cell's."""
-    found = []
-    for name, serial in (("robot", robot_serial), ("camera", camera_serial)):
-        device = getattr(calibration, name)
-        if serial and device.serial != serial:
-            found.append(f"It is of {name} {device.serial or 'unknown'}, the cell has {serial}.")
-        installed = device if before is None else getattr(before, name)
-        if (installed.model, installed.serial) != (device.model, device.serial):
-            found.append(
-                f"It is of {name} {device.model} {device.serial}, the installed one of {installed.model} "
-                f"{installed.serial}."
-            )
-    if before is not None and before.mount != calibration.mount:
-        found.append(f"It is {calibration.mount}, the installed one {before.mount}.")
-    if not calibration.intrinsics.matrix:
-        found.append("It was made without pictures: no gate judged them, and the lens is not known.")
-    return found

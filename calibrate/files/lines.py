@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import msgspec
 
-from recordings.files import LOG_LIMIT_BYTES, open_regular, read_file
+from recordings.files import LOG_LIMIT_BYTES, open_regular
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -39,11 +39,19 @@ def share(path: Path) -> None:
 
 
 def read_lines(path: Path, kind: type[S]) -> list[S]:
-    """Read a file, oldest line first; empty when there is none. Lines that are no `kind` are skipped."""
+    """Read a file, oldest line first; empty when there is none. Lines that are no `kind` are skipped.
+
+    Of one that has grown beyond the limit, its end. Raises OSError.
+    """
+    try:
+        descriptor = open_regular(path)
+    except FileNotFoundError:
+        return []
+    with os.fdopen(descriptor, "rb") as file:
+        file.seek(max(file.seek(0, os.SEEK_END) - LOG_LIMIT_BYTES, 0))
+        lines = file.read().splitlines()
     found = []
-    for line in (read_file(path, LOG_LIMIT_BYTES) if path.exists() else b"").splitlines():
-        try:
+    for line in lines:
+        with suppress(msgspec.DecodeError, UnicodeDecodeError):
             found.append(msgspec.json.decode(line, type=kind))
-        except (msgspec.DecodeError, UnicodeDecodeError):
-            continue
     return found

@@ -57,9 +57,9 @@ class InstalledVersion:
     current: bool
     calibration: Calibration | None
     """Content; None when the file is damaged (`problem`)."""
-    problem: str = ""
-    validity: Validity | None = None
+    validity: Validity
     """Validity now; for a version that is not current, as when it was replaced."""
+    problem: str = ""
     change: str = ""
     """Difference to the version before; of the one that was just switched to."""
 
@@ -102,7 +102,7 @@ def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> l
         number, is_current = int(match[1]), path.name == current
         validity = recorded.get(number) or unrecorded(number)
         validity = validity.at(now) if is_current else validity
-        found.append(InstalledVersion(number, path, is_current, calibration, problem, validity))
+        found.append(InstalledVersion(number, path, is_current, calibration, validity, problem))
     return sorted(found, key=lambda version: version.number)
 
 
@@ -130,7 +130,7 @@ def before_current(known: list[InstalledVersion], log: list[LogEntry]) -> Instal
         used.append(number)
     by_number = {version.number: version for version in known}
     for older in (by_number[number] for number in reversed(used) if number in by_number):
-        withdrawn = older.validity is not None and older.validity.state is ValidityState.WITHDRAWN
+        withdrawn = older.validity.state is ValidityState.WITHDRAWN
         if older.calibration and not withdrawn and not same_solve(older.calibration, current.calibration):
             return older
     return None
@@ -163,8 +163,8 @@ def add_version(
         write_atomically(path, content)
         share(path)
         decode_calibration(read_bounded(path), str(path))
-        version = InstalledVersion(number, path, True, calibration)
-        return make_current(folder, version, action, validity, change, reason)
+        version = InstalledVersion(number, path, True, calibration, replace(validity, version=number))
+        return make_current(folder, version, action, change, reason)
     except BaseException:
         if current_name(folder) != path.name:
             path.unlink(missing_ok=True)
@@ -172,15 +172,14 @@ def add_version(
 
 
 def make_current(
-    folder: Path, version: InstalledVersion, action: Action, validity: Validity, change: str, reason: str = ""
+    folder: Path, version: InstalledVersion, action: Action, change: str, reason: str = ""
 ) -> InstalledVersion:
     """Switch to a version and log it. Call inside `locked` only. InstallError where it reads back wrong."""
-    validity = replace(validity, version=version.number)
     entry = LogEntry(time_text(), action, version.number, who(), change, reason, _current_number(folder))
-    line = asdict(validity) | {"switch": entry}
+    line = asdict(version.validity) | {"switch": entry}
     append_line(folder / VALIDITY_FILE, line)  # before the switch, so that it is never missing
     _switch(folder, version.path.name, read_bounded(version.path))
-    return replace(version, current=True, validity=validity, change=change)
+    return replace(version, current=True, change=change)
 
 
 def _current_number(folder: Path) -> int:

@@ -10,9 +10,10 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from calibrate.annotate import placed_corners
 from calibrate.boards.corners import to_grey
-from calibrate.boards.model import board_from_turned, board_points, describe_board, looks_same_turns
-from calibrate.files.calibration import source_stamp
+from calibrate.boards.model import board_points, describe_board
+from calibrate.files.calibration import SOURCE_STAMPS
 from calibrate.files.formatting import (
     arm_sentences,
     cell_sentences,
@@ -61,7 +62,7 @@ def report_page(job: SolvedRecording) -> str:
 
 def _verdict(job: SolvedRecording) -> Iterator[str]:
     calibration = job.calibration
-    if stamp := source_stamp(calibration.source):
+    if stamp := SOURCE_STAMPS[calibration.source]:
         yield html.stamp(f"{stamp}. It is not installed on a real cell.")
     yield html.paragraph(rehearsal_text(job))
     yield html.verdict("good" if job.passed else "bad", use_text(calibration), verdict_text(calibration))
@@ -126,19 +127,17 @@ def _placed(job: SolvedRecording, view: View) -> tuple[Array, Array, float]:
     calibration, board = job.calibration, board_points(job.calibration.board)
     seen = job.loaded.detections[view.index]
     X, B = calibration.transform.matrix, calibration.board_place.transform.matrix
-    placed = board_in_camera(calibration.mount, np.array(view.base_from_flange), X, B)
+    C = board_in_camera(calibration.mount, np.array(view.base_from_flange), X, B)
     low, high = board.min(axis=0), board.max(axis=0)
     corners = np.array([low, [high[0], low[1], 0], high, [low[0], high[1], 0], low])
     outline = np.concatenate([np.linspace(a, b, 20) for a, b in pairwise(corners)])  # a lens bends them
 
-    def shown_at(points: Array, C: Array = placed) -> Array:
+    def shown_at(points: Array) -> Array:
         at = project_pixels(calibration.intrinsics.model, points @ C[:3, :3].T + C[:3, 3])
         return np.nan_to_num(at)
 
-    turns = (board_from_turned(calibration.board, q) for q in (0, *looks_same_turns(calibration.board)))
-    orders = [shown_at(board[seen.indices], placed @ turned) for turned in turns]
-    off_px = min(float(np.sqrt(np.square(at - seen.pixels).sum(axis=1).mean())) for at in orders)
-    return shown_at(outline), shown_at(board), off_px
+    off = np.nan_to_num(placed_corners(calibration, view.base_from_flange, seen)) - seen.pixels
+    return shown_at(outline), shown_at(board), float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
 
 def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, float]:

@@ -113,7 +113,7 @@ async def undo_install(link: DaemonLink, result: Result, calibration: Calibratio
 
 async def _withdraw(link: DaemonLink, root: Path, camera: str, current: InstalledVersion) -> None:
     """Ask why, then withdraw what is installed."""
-    if current.validity is not None and current.validity.state is ValidityState.WITHDRAWN:
+    if current.validity.state is ValidityState.WITHDRAWN:
         link.app.notify("It is out of use already, and there is none before it to go back to.")
         return
     body = (

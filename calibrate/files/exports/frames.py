@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from calibrate.errors import UsageError
-from calibrate.files.calibration import Calibration, source_stamp
+from calibrate.files.calibration import SOURCE_STAMPS, Calibration
 from calibrate.files.validity import Validity, validity_text
 from calibrate.geometry import Array, inverse, pose
 from calibrate.kinematics import MODELS
@@ -114,7 +114,7 @@ def comment(calibration: Calibration, frames: FrameNames, corrected: bool = Fals
 
     Always one line: a line break in a name must not become a line of a launch file or a script.
     """
-    stamp = source_stamp(calibration.source)
+    stamp = SOURCE_STAMPS[calibration.source]
     origin = f"{calibration.provenance.session}, solved {calibration.created}"
     held = "" if frames.validity is None else validity_text(frames.validity)
     two = ("the corrected arm", "the arm as it is")[:: 1 if corrected else -1]

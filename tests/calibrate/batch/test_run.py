@@ -15,6 +15,7 @@ import pytest
 
 from calibrate.batch.run import RESULTS, BatchResult, batch_key, run_batch
 from calibrate.batch.workers import Lost, R, T, pool
+from calibrate.document import _source_sha256
 from calibrate.files.lines import read_lines
 from calibrate.job import JobOptions
 from calibrate.resource_limits import Limits
@@ -122,6 +123,13 @@ def test_other_options_or_a_changed_recording_are_solved_again(
     with monkeypatch.context() as patch:
         patch.setattr("calibrate.batch.run.solver_software", lambda: {"calibration-station": "0.0.1"})
         assert key != batch_key(recordings[0], JobOptions())
+    with monkeypatch.context() as patch:  # a checkout, whose version stays while it changes
+        _source_sha256.cache_clear()
+        read = Path.read_bytes
+        patch.setattr(Path, "read_bytes", lambda path: read(path) + b"#" * (path.name == "solve.py"))
+        assert key != batch_key(recordings[0], JobOptions())
+    _source_sha256.cache_clear()
+    assert key == batch_key(recordings[0], JobOptions())
     os.utime(recordings[0], (1, 1))
     assert key != batch_key(recordings[0], JobOptions())
     folder = recordings[0].parent
@@ -129,6 +137,12 @@ def test_other_options_or_a_changed_recording_are_solved_again(
     recordings[1].write_bytes(b"new data")
     os.utime(folder, ns=(told.st_atime_ns, told.st_mtime_ns))
     assert before != batch_key(folder, JobOptions())
+
+
+def test_recordings_that_are_not_there_are_told_apart(tmp_path: Path) -> None:
+    missing = [tmp_path / name for name in ("monday.mcap", "tuesday.mcap")]
+    results = run_batch(missing, tmp_path / "out", workers=in_this_process)
+    assert [result.recording for result in results] == [str(path) for path in missing]
 
 
 def test_a_name_may_be_long_and_of_any_bytes(recordings: list[Path], tmp_path: Path) -> None:

@@ -251,7 +251,7 @@ def test_too_few_or_untelling_views_are_refused() -> None:
 KNOWN = installed()
 
 
-def entry(day: float, shift_mm: float, generation: int = 1, board: BoardSpec | None = None) -> CheckEntry:
+def entry(day: float, shift_mm: float, board: BoardSpec | None = None) -> CheckEntry:
     """A check that tells X ⊕ δ to 0.05 mm and 1e-5 rad, and nothing of lens and board."""
     N = np.zeros((len(SIGMA), len(SIGMA)))
     N[:6, :6] = np.diag(np.r_[np.full(3, 0.05e-3), np.full(3, 1e-5)] ** -2.0)
@@ -259,19 +259,28 @@ def entry(day: float, shift_mm: float, generation: int = 1, board: BoardSpec | N
     check = quiet_check()
     evidence = Quadratic(N, N[:, :6] @ shift)
     return entry_of(
-        msgspec.structs.replace(check, evidence=evidence, shift=shift), day * 86400, generation, "r", board
+        msgspec.structs.replace(check, evidence=evidence, shift=shift), day * 86400, 1, "r", board
     )
 
 
-def test_a_trend_is_found_before_a_check_fails(tmp_path: Path) -> None:
-    for day in range(8):
-        append_check(entry(day, 0.05 * day), tmp_path)
-    trend = find_trend(read_checks(tmp_path), 1, KNOWN)
+def test_a_trend_is_found_before_a_check_fails() -> None:
+    trend = find_trend([entry(day, 0.05 * day) for day in range(8)], KNOWN)
     assert trend is not None and (trend.days, trend.checks) == (7, 8)
     assert (trend.shift_mm, trend.shift_deg) == pytest.approx((0.35, 0.0), abs=1e-6)
-    assert find_trend(read_checks(tmp_path), 2, KNOWN) is None
     steady = [entry(day, 0.1) for day in range(8)]
-    assert find_trend(steady, 1, KNOWN) is None and find_trend(steady[:3], 1, KNOWN) is None
+    assert find_trend(steady, KNOWN) is None
+
+
+def test_a_history_that_has_grown_large_keeps_its_newest_checks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hourly checks fill the limit within months; they go on."""
+    (tmp_path / "calibrations").mkdir()
+    for day in range(8):
+        append_check(entry(day, 0.0), tmp_path)
+    size = (tmp_path / "calibrations/checks.jsonl").stat().st_size
+    monkeypatch.setattr("calibrate.files.lines.LOG_LIMIT_BYTES", size // 2)
+    assert [round(check.wall_s / 86400) for check in read_checks(tmp_path)] in ([4, 5, 6, 7], [5, 6, 7])
 
 
 @pytest.mark.parametrize("freedom", [9.0, 69.0])
@@ -279,20 +288,20 @@ def test_a_trend_is_told_from_chance_at_one_percent(freedom: float) -> None:
     """The slope of eight days has a variance of σ² / 42; σ is the calibration's, its square follows 6·F."""
     slope_mm, known = 0.05 * np.sqrt(6 * stats.f.ppf(0.99, 6, freedom) / 42), replace(KNOWN, freedom=freedom)
     for factor in (0.99, 1.01):
-        wandering = find_trend([entry(day, 0.3 + factor * slope_mm * day) for day in range(8)], 1, known)
+        wandering = find_trend([entry(day, 0.3 + factor * slope_mm * day) for day in range(8)], known)
         assert bool(wandering) == (factor > 1)
 
 
 def test_another_board_is_not_a_step_of_the_trend() -> None:
     """Printed larger, it shows the camera elsewhere in each of its checks; its own trend is found."""
     swapped = [entry(day, 0.5 * (day > 2), board=PAPER_BOARD if day > 2 else None) for day in range(6)]
-    assert find_trend(swapped, 1, KNOWN) is None and find_trend(swapped, 1, KNOWN, PAPER_BOARD) is None
+    assert find_trend(swapped, KNOWN) is None and find_trend(swapped, KNOWN, PAPER_BOARD) is None
     creeping = [*swapped, *(entry(day, 0.5 * day, board=PAPER_BOARD) for day in range(6, 12))]
-    trend = find_trend(creeping, 1, KNOWN, PAPER_BOARD)
-    assert trend is not None and trend.checks == 9 and find_trend(creeping, 1, KNOWN) is None
+    trend = find_trend(creeping, KNOWN, PAPER_BOARD)
+    assert trend is not None and trend.checks == 9 and find_trend(creeping, KNOWN) is None
 
 
 def test_four_checks_or_one_moment_are_no_trend() -> None:
     strong = [entry(day, 1.0 * day) for day in range(5)]
-    assert find_trend(strong[:4], 1, KNOWN) is None
-    assert find_trend([entry(3.0, 1.0 * k) for k in range(5)], 1, KNOWN) is None
+    assert find_trend(strong[:4], KNOWN) is None
+    assert find_trend([entry(3.0, 1.0 * k) for k in range(5)], KNOWN) is None

@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 
 from calibrate import load_installed
-from calibrate.check.history import read_checks
+from calibrate.check.history import append_check, read_checks
 from calibrate.errors import InstallError
+from calibrate.files import lines
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
 from calibrate.files.touch import Touch
 from calibrate.files.validity import ValidityState
+from calibrate.files.versions import note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from tests.calibrate.calling import refused, run
 from tests.calibrate.sessions import Scene, shifted, write_session
@@ -141,6 +143,46 @@ def test_a_check_judges_the_calibration_that_it_was_made_on(
     monkeypatch.setattr("calibrate.cli.drift_check._is_origin", lambda *_: False)
     refused(run("drift-check", real_session_file, "--root", root, cwd=tmp_path), 1, "other-version")
     assert load_installed(root).validity.state is ValidityState.VALID
+
+
+def test_a_touch_test_does_not_begin_the_trend_anew(real_file: Path, tmp_path: Path) -> None:
+    """It makes another version of the same solve."""
+    install(real_file, root := tmp_path / "cell")
+    check = ("--root", root, "--json")
+    later = Scene(views=6, seed=5)
+    new = write_session(tmp_path / "new.mcap", later, known_lens=True, source="real", name="later")
+    assert not json.loads(run("drift-check", new, *check, cwd=tmp_path).stdout)["trend"]
+    (first,) = read_checks(root)
+    for week in range(1, 5):
+        right = tuple(1e4 * week + value for value in first.right)
+        append_check(msgspec.structs.replace(first, wall_s=first.wall_s - 6e5 * week, right=right), root)
+    touch = Touch(0, (0.0, 0.0), (0.1, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01")
+    note_installed(root, [touch])
+    assert json.loads(run("drift-check", new, *check, cwd=tmp_path).stdout)["trend"]
+
+
+@pytest.mark.parametrize("lost", ["checks.jsonl", "validity.jsonl"])
+def test_a_check_is_told_though_it_cannot_be_noted(
+    real_session_file: Path, real_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost: str
+) -> None:
+    """A disk that takes no log must not hide that the camera moved."""
+    moved = shifted(read_calibration(real_file), 0.02)
+    write_calibration(msgspec.structs.replace(moved, posterior=None), tmp_path / "moved.yaml")
+    install(tmp_path / "moved.yaml", root := tmp_path / "cell")
+    monkeypatch.setattr("calibrate.cli.drift_check._is_origin", lambda *_: False)
+    write = lines.open_regular
+
+    def full(path: Path, flags: int = 0) -> int:
+        if path.name == lost and flags:
+            raise OSError(28, "No space left on device")
+        return write(path, flags)
+
+    monkeypatch.setattr(lines, "open_regular", full)
+    done = run("drift-check", real_session_file, "--root", root, "--json", cwd=tmp_path)
+    answer = json.loads(done.stdout)
+    assert (done.returncode, answer["passed"]) == (4, False) and "No space left" in done.stderr
+    judged = load_installed(root, require_valid=False).validity.state
+    assert (judged is ValidityState.VALID) == (lost == "validity.jsonl")
 
 
 @pytest.mark.parametrize(("device", "elsewhere"), [("robot", False), ("camera", False), ("robot", True)])

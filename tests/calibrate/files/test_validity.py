@@ -20,9 +20,9 @@ from calibrate.files.calibration import read_calibration
 from calibrate.files.folders import cameras
 from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
 from calibrate.files.integrity import canonical_json
-from calibrate.files.touch import Touch
+from calibrate.files.touch import Touch, agrees, touch_sigmas
 from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState, validity_text
-from calibrate.files.versions import installed_versions, note_installed
+from calibrate.files.versions import installed_versions, note_in_file, note_installed, read_log
 from tests.codes import raises
 from tests.patience import PATIENCE_S
 
@@ -145,12 +145,41 @@ def test_a_missed_corner_puts_it_in_doubt_and_a_met_one_clears_that(root: Path) 
     assert load_installed(root).validity.state is V
 
 
+def test_a_corner_alarms_beyond_three_sigmas_of_both_together() -> None:
+    """0.4 mm predicted and 0.3 mm by hand are 0.5 mm; of two numbers 1 % lies beyond 3.03 sigmas."""
+    found = msgspec.structs.replace(touch(0.0), sigma_mm=(0.4, 0.4), offset_mm=(0.3, -0.4))
+    assert touch_sigmas(found) == pytest.approx(1.0)
+    near, far = (msgspec.structs.replace(found, offset_mm=(0.0, 0.5 * sigmas)) for sigmas in (3.02, 3.05))
+    assert agrees(near) and not agrees(far)
+
+
+def test_touches_stay_in_a_file_that_is_installed_and_make_a_version_of_what_is(
+    own_file: Path, tmp_path: Path
+) -> None:
+    before, root, good = read_calibration(own_file), tmp_path / "s", touch(0.1)
+    with raises("nothing-installed", InstallError):
+        note_installed(root, [good])
+    note_in_file(own_file, [good])
+    note_in_file(own_file, [good])
+    assert read_calibration(own_file) == msgspec.structs.replace(before, verification=[good, good])
+    install(own_file, root)
+    note_installed(root, [good])
+    assert installed_calibration(root).verification == [good] * 3
+    assert [g.number for g in installed_versions(root)] == [1, 2]
+    assert read_log(root)[-1].action == "verify"
+    rollback(root, to=1)  # by its number: going back alone leads to another solve
+    assert installed_calibration(root).verification == [good] * 2
+
+
 @pytest.mark.parametrize(("source", "override"), [("imported", ""), ("real", "the hand slipped")])
 def test_what_nobody_vouches_for_is_unverified(
     make_file: MakeFile, tmp_path: Path, source: str, override: str
 ) -> None:
     path = make_file(source=source, verification=[touch(5.0)] if override else [])
     cell = "imported" if source == "imported" else "real"
+    if override:
+        with raises("objection", InstallError, objections=1, gates=0):
+            install(path, tmp_path / "s")
     install(path, tmp_path / "s", cell=cell, override=override)
     assert load_installed(tmp_path / "s").validity.state is U
 

@@ -148,21 +148,6 @@ def test_a_change_is_told_in_millimetres_and_degrees(solved_real: SolvedRecordin
     assert change_text(before, msgspec.structs.replace(after, mount="eye-to-hand", result=fixed)) == ""
 
 
-def test_what_was_configured_for_the_cell_is_held_against_the_file(
-    make_file, solved_real: SolvedRecording, tmp_path: Path
-) -> None:
-    robot, camera = solved_real.calibration.robot, solved_real.calibration.camera
-    with raises("objection", InstallError, objections=1):
-        install(make_file(), tmp_path / "s", camera_serial="4712")
-    with raises("objection", InstallError, objections=1):
-        install(make_file(), tmp_path / "s", robot_serial="4711")
-    unknown = make_file(robot=msgspec.structs.replace(robot, serial=""))
-    with raises("objection", InstallError, objections=1):
-        install(unknown, tmp_path / "s", robot_serial="4711")
-    assert installed_versions(tmp_path / "s") == []
-    install(make_file(), tmp_path / "s", robot_serial=robot.serial, camera_serial=camera.serial)
-
-
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can be two operators")
 @pytest.mark.parametrize("umask", [0o022, 0o077])
 def test_two_operators_of_a_group_share_a_folder(make_file, umask: int) -> None:

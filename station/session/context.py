@@ -18,6 +18,7 @@ from recordings.schema.messages import CaptureEvent, RobotState, Stamps
 from station.analysis.pool import Workers
 from station.analysis.worker import CapturedView
 from station.cell.errors import RefusedError
+from station.cell.session_folder import SessionState
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import ready
@@ -128,6 +129,29 @@ class SessionContext:
                 for found in await self.workers.call(recover_recording, recording.folder):
                     self.store.event("recovered", f"recovered {found.text}")
             await DISK.run(recording.count_segments)
+
+    def restore(self, folder: Path, state: SessionState) -> None:
+        """Show an interrupted session's poses, in state `stopped` until acknowledged. Nothing moves."""
+        if state.source != self.cell.source:
+            self.store.event(
+                "interrupted-elsewhere",
+                f"Session {folder.name} of a {state.source} cell is unfinished and cannot continue here: "
+                f"this cell is {self.cell.source}. `recordings recover {folder}` saves it.",
+                "warning",
+            )
+            return
+        self.queue = PoseQueue(state.plan, state.poses)
+        self.recording = SessionRecording(
+            self.root, self.cell, folder, state.parts, state.elapsed_s, state.check
+        )
+        reason = (
+            f"The daemon ended during session {folder.name}; its {self.queue.done} poses are on the disk. "
+            "Look at the arm, acknowledge, then resume or finish."
+        )
+        self.store.enter(StationState.STOPPED, reason, "interrupted")
+        self.show_poses()
+        self.store.update_session(elapsed_s=state.elapsed_s, check=state.check)
+        self.store.event("interrupted", reason, "warning", captured=self.queue.done)
 
     def forget_session(self, check: bool = False) -> None:
         """Clear the last session from the status when a session begins; `check`: as a drift check."""

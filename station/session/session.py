@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +18,9 @@ import msgspec
 from recordings.errors import RecordingError
 from station.analysis.pool import Workers
 from station.analysis.worker import start_worker, warm_up
-from station.cell.errors import RefusedError, RobotError
+from station.cell.errors import RefusedError, RobotError, StationError
 from station.cell.pose_plan import Plan
-from station.cell.session_folder import SessionState, interrupted_session
+from station.cell.session_folder import interrupted_session
 from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import fresh
@@ -27,7 +28,7 @@ from station.devices.cell import Cell
 from station.plan.choose import CRITERIA, Aim
 from station.plan.planner import make_plan
 from station.protocol import verbs
-from station.protocol.states import RUNNING
+from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext, StatusStore
 from station.session.device_connector import DeviceConnector
@@ -37,7 +38,6 @@ from station.session.freedrive import FreedriveCapture
 from station.session.motion import ApprovalManager, MotionApproval, previewed, session_motion
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue
-from station.session.recording import SessionRecording
 from station.session.run import Run
 from station.session.stop_move import stop_motion
 from station.session.supervisor import SessionSupervisor
@@ -52,6 +52,8 @@ END_RUN_AT_CLOSE_S, CLOSE_DEVICES_S = 1.0, 1.8
 STOP_WAIT_S = 1.0
 """Longest time that the answer to STOP, sent after the arm was stopped, waits for data being written."""
 PLAN_TIMEOUT_S = 180.0
+BEGIN_AGAIN_S = 1.0
+"""Pause after a defect in a task of the daemon: within it nothing may move, as no heartbeat is sent."""
 
 
 class Session:
@@ -85,11 +87,24 @@ class Session:
         self.context.root.mkdir(parents=True, exist_ok=True)
         found = await DISK.run(interrupted_session, self.context.root)
         if found is not None:
-            show_interrupted(self.context, *found)
+            self.context.restore(*found)
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
-        loops = (self.supervisor.run(), self.devices.run(), self._estimator.run(), self.freedrive.run())
-        self._tasks = [asyncio.create_task(loop) for loop in loops]
+        loops = (self.supervisor.run, self.devices.run, self._estimator.run, self.freedrive.run)
+        self._tasks = [asyncio.create_task(self._kept_going(loop)) for loop in loops]
+
+    async def _kept_going(self, loop: Callable[[], Awaitable[object]]) -> None:
+        """Run a task of the daemon's life; a defect in it ends in fault, then it begins again."""
+        while True:
+            try:
+                await loop()
+                return
+            except Exception as error:
+                log.exception("a task of the daemon failed")
+                defect = StationError("internal", error=repr(error))
+                if self.store.state not in LATCHED:
+                    await self._halt(StationState.FAULT, defect.text, defect.code)
+                await asyncio.sleep(BEGIN_AGAIN_S)
 
     async def close(self) -> None:
         """Stop the arm, finish the recording, then close devices and worker."""
@@ -380,27 +395,3 @@ class Session:
         """Withdraw the motion that is offered for approval, if any."""
         self.approvals.void()
         self.store.update(go=None)
-
-
-def show_interrupted(context: SessionContext, folder: Path, state: SessionState) -> None:
-    """Restore an interrupted session's poses, in state `stopped` until acknowledged. Nothing moves."""
-    if state.source != context.cell.source:
-        context.store.event(
-            "interrupted-elsewhere",
-            f"Session {folder.name} of a {state.source} cell is unfinished and cannot continue here: this "
-            f"cell is {context.cell.source}. `recordings recover {folder}` saves it.",
-            "warning",
-        )
-        return
-    context.queue = PoseQueue(state.plan, state.poses)
-    context.recording = SessionRecording(
-        context.root, context.cell, folder, state.parts, state.elapsed_s, state.check
-    )
-    reason = (
-        f"The daemon ended during session {folder.name}; its {context.queue.done} poses are on the disk. "
-        "Look at the arm, acknowledge, then resume or finish."
-    )
-    context.store.enter(StationState.STOPPED, reason, "interrupted")
-    context.show_poses()
-    context.store.update_session(elapsed_s=state.elapsed_s, check=state.check)
-    context.store.event("interrupted", reason, "warning", captured=context.queue.done)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import shutil
 import time
 from collections import deque
@@ -127,8 +126,6 @@ def _read_files(context: SessionContext) -> _Files:
     return _Files(free_bytes, context.cell.acceptance_trouble(context.root))
 
 
-log = logging.getLogger(__name__)
-
 TICK_S = 0.02
 STATUS_TICKS = 5
 
@@ -143,7 +140,6 @@ class SessionSupervisor:
         """Called first in every round."""
         self.ticked: Callable[[], None] = lambda: None
         """Called after every round."""
-        self._failure = ""
         self._silent = ""
         """Code of what is wrong while the robot's states are later than allowed; empty: they are not."""
         self._late_since_s = 0.0
@@ -152,7 +148,7 @@ class SessionSupervisor:
         """Delay of each round of the last second."""
 
     async def run(self) -> None:
-        """Run for the daemon's life."""
+        """Run for the daemon's life; the session ends a defect in it as a fault."""
         due_s, number = time.monotonic(), 0
         while True:
             now_s = time.monotonic()
@@ -167,19 +163,9 @@ class SessionSupervisor:
         if self._context.store.state in RUNNING and (mover := self._context.cell.mover) is not None:
             mover.heartbeat()
         if number % STATUS_TICKS == 0:
-            self._look()
-        self.ticked()
-
-    def _look(self) -> None:
-        """Refresh the status. An error is reported and does not end the heartbeat."""
-        try:
             self._watch_link()
             self._monitor.refresh()
-        except Exception as error:
-            if repr(error) != self._failure:
-                self._failure = repr(error)
-                log.exception("the status could not be refreshed")
-                self._context.store.problem(error, "error", said="the status could not be refreshed: {!r}")
+        self.ticked()
 
     def lag_ms(self) -> float:
         """Return the largest delay of the last second, ms."""

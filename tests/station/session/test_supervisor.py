@@ -57,3 +57,23 @@ async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) 
     summary = await rig.session.prepare(1, Purpose.RUN)
     assert summary.warnings == ("PLAYBACK of a recording: no arm moves",)
     assert rig.session.store.status.robot.condition.held == ""
+
+
+@pytest.mark.parametrize("place", ["first", "ticked", "_watch_link"])
+async def test_a_defect_in_the_heartbeats_loop_stops_the_arm_in_fault_and_the_loop_goes_on(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    def broken() -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("station.session.session.BEGIN_AGAIN_S", 0.01)
+    await rig.go_until_it_moves()
+    with monkeypatch.context() as patch:
+        patch.setattr(rig.session.supervisor, place, broken)
+        await rig.until(S.FAULT)
+        assert rig.cause == "internal" and rig.told("internal")
+        await until(lambda: "stop" in rig.arm.log)
+    await rig.session.acknowledge("anna")
+    rig.arm.beats, rig.arm.slow = 0, False
+    await rig.go_until(S.IDLE, purpose=Purpose.RESUME)
+    assert rig.arm.beats and len(sealed(rig).views()) == POSES

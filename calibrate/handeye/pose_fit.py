@@ -177,6 +177,8 @@ class PoseViews:
     """(n,) mask of the views after camera or board was moved; None where nothing was."""
     moved: Moved = "board"
     """Camera (X has a second value) or board (Y has)."""
+    corner_px: float = 0.0
+    """Noise of a corner per axis, by what the images left; 0: there are none."""
 
     def __len__(self) -> int:
         return len(self.flange)
@@ -210,7 +212,8 @@ def pose_views(views: ViewSet, focal_sigma: float, size_sigma: float) -> PoseVie
     modes = CornerModes.of(blocks, U, slice(0))
     focal = -modes.free.by_shared[..., :2] @ intrinsics_vector(views.camera)[:2]
     boards = BoardPoses(C, np.stack([size, focal]), np.array([size_sigma, focal_sigma]))
-    return PoseViews(views.mount, observed.flange, boards, modes.typical_px**2 * U)
+    corner_px = modes.typical_px
+    return PoseViews(views.mount, observed.flange, boards, corner_px**2 * U, corner_px=corner_px)
 
 
 @dataclass(frozen=True, eq=False)

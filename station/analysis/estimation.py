@@ -15,8 +15,10 @@ from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose, project_to_rotation
-from calibrate.handeye.information import USUAL_NOISE, covariance_of, prior_information, view_information
+from calibrate.handeye.information import covariance_of, prior_information, view_information
 from calibrate.handeye.metrics import median_distance_m, point_error_m
+from calibrate.handeye.noise_scales import MeasurementNoise
+from calibrate.handeye.pose_fit import fit_poses, pose_views
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
@@ -34,6 +36,8 @@ FEWEST_FOR_CELL, FEWEST_FOR_ESTIMATE = 3, 4
 FEWEST_FOR_LENS = 6
 """Views from which a lens that is known roughly is estimated; from three on where nothing is known of it."""
 COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
+FOCAL_SIGMA = 0.02
+"""1σ, relative, of the focal length that so few views give."""
 
 
 def running_estimate(
@@ -52,7 +56,8 @@ def running_estimate(
         return blank
     try:
         views, X, Y = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
-        covariance = quick_covariance(views, config.board, X, Y, not lens_is_known)
+        noise = measured_noise(views, config.board)
+        covariance = quick_covariance(views, config.board, X, Y, not lens_is_known, noise)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return blank
     distance_m = median_distance_m(views.camera_from_board)
@@ -109,11 +114,23 @@ def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
     return X, np.asarray(gripper[0] @ X @ board[0])
 
 
-def quick_covariance(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> Array:
+def measured_noise(views: ViewSet, board: BoardSpec) -> MeasurementNoise:
+    """Measure the noise of corners and robot by how far the views agree. Raises LinAlgError.
+
+    The solution states its error by the same: a coarse arm, or poor light, is not taken for a usual one.
+    """
+    poses = pose_views(views, FOCAL_SIGMA, BoardTolerance.of(board).square)
+    robot_m, robot_rad = fit_poses(poses).solved.scales.robot.tolist()
+    return MeasurementNoise(poses.corner_px, robot_m, robot_rad)
+
+
+def quick_covariance(
+    views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool, noise: MeasurementNoise
+) -> Array:
     """Predict the covariance (6, 6) of X. LinAlgError where X and Y put the board out of sight."""
     points = board_points(board)
     flange = views.base_from_flange
-    each = view_information(views.mount, views.camera, flange, X, Y, points, USUAL_NOISE)
+    each = view_information(views.mount, views.camera, flange, X, Y, points, noise)
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
     covariance = covariance_of(each.sum(axis=0), prior)[:6, :6]
     if not np.isfinite(covariance).all():

@@ -16,13 +16,20 @@ import numpy as np
 
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, difference, inverse
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.pose_fit import fit_poses, pose_views
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.views import ViewSet, implied_flange
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
-from station.analysis.estimation import FEWEST_FOR_CELL, quick_covariance, solve_quickly
+from station.analysis.estimation import (
+    FEWEST_FOR_CELL,
+    FOCAL_SIGMA,
+    measured_noise,
+    quick_covariance,
+    solve_quickly,
+)
 from station.analysis.worker import CapturedView
 from station.cell.errors import StationError
 from station.cell.layout import board_place
@@ -51,6 +58,8 @@ class FoundCell:
     """flange_from_camera (eye-in-hand) or base_from_camera, (4, 4)"""
     Y: Array
     """base_from_board (eye-in-hand) or flange_from_board, (4, 4)"""
+    noise: MeasurementNoise
+    """By the views."""
     sigma_m: float
     sigma_rad: float
     spread_m: float
@@ -104,7 +113,8 @@ def find_cell(
         views, X, Y = solve_quickly(mount, camera, lens_known, board, seen)
         other: Mount = "eye-to-hand" if mount == "eye-in-hand" else "eye-in-hand"
         other_views, other_X, _ = solve_quickly(other, views.camera, True, board, seen)
-        variances = np.diag(quick_covariance(views, board, X, Y, not lens_known))
+        noise = measured_noise(views, board)
+        variances = np.diag(quick_covariance(views, board, X, Y, not lens_known, noise))
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None
     spread_m, other_m = _spread_m(views, X), _spread_m(other_views, other_X)
@@ -114,6 +124,7 @@ def find_cell(
         views=views,
         X=X,
         Y=Y,
+        noise=noise,
         sigma_m=max(sigma_m, _LEAST_SIGMA_M),
         sigma_rad=max(float(np.sqrt(variances[3:].sum())), _LEAST_SIGMA_RAD),
         spread_m=spread_m,
@@ -155,8 +166,6 @@ def _scale(views: ViewSet, X: Array) -> float:
 
 FEWEST = 6
 """Views from which one is judged: by five, a rough lens still hides a wrong one, or makes one."""
-_FOCAL_SIGMA = 0.02
-"""1σ, relative, of the focal length that so few views give."""
 _ORDINARY = 0.05
 """Probability of being an ordinary view below which one is asked about."""
 _WAYS = {
@@ -183,7 +192,7 @@ def odd_view(
         return None
     try:
         views, _, _ = solve_quickly(mount, camera, lens_known, board, seen)
-        poses = pose_views(views, _FOCAL_SIGMA, BoardTolerance.of(board).square)
+        poses = pose_views(views, FOCAL_SIGMA, BoardTolerance.of(board).square)
         fit = fit_poses(poses)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None

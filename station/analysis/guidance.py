@@ -118,11 +118,11 @@ def next_view(
     """
     points, found = board_points(board), find_cell(mount, board, camera, lens_known, seen)
     if found is None:  # as if the flange were the camera: how much is learned depends on its turns
-        views = _placed(as_views(mount, _usual_lens(camera), board, seen), board)
+        views, noise = _placed(as_views(mount, _usual_lens(camera), board, seen), board), USUAL_NOISE
         X = Y = np.eye(4)
         flange = implied_flange(mount, X, Y, _boards(views))
     else:
-        views, X, Y = found.views, found.X, found.Y
+        views, X, Y, noise = found.views, found.X, found.Y, found.noise
         flange = views.base_from_flange
     lens, at, pool = views.camera, _boards(views), _candidates(views, board, given_up)
     prior = prior_information(lens, lens_known, BoardTolerance.of(board))
@@ -130,7 +130,7 @@ def next_view(
     distance_m = median_distance_m(at if len(at) else pool)
     objective = Objective("A", distance_m, prior, free)
     flange = np.concatenate([flange, implied_flange(mount, X, Y, pool)])
-    each = view_information(mount, lens, flange, X, Y, points, USUAL_NOISE)
+    each = view_information(mount, lens, flange, X, Y, points, noise)
     known, gains = each[: len(at)].sum(axis=0), each[len(at) :]
     best = int(np.argmin(objective(known + gains)))
     after_m = None if found is None else predicted_error_m(known + gains[best], prior, X, distance_m)

@@ -191,7 +191,8 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
     views: int = 0
     predicted_error_mm: float | None = None
-    """1σ of a point at the working distance, as the calibration file states it."""
+    """1σ of a point at the working distance, by the noise that the images so far show. Solving adds errors of
+    the arm that are the same in every image."""
     working_distance_m: float | None = None
     """Median distance of camera and board."""
     camera_pose: Matrix4 | None = None

@@ -50,7 +50,7 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
     now_mm, after_mm = status.estimate.predicted_error_mm, guidance.after_mm
     rows = [still_line(guidance, STILL_CELLS)]
     rows.append(facts(("view", str(status.session.captured), f"of {status.session.least_by_hand} or more")))
-    if after_mm is not None and (now_mm is None or after_mm < now_mm):
+    if not status.session.check and after_mm is not None and (now_mm is None or after_mm < now_mm):
         rows.append(error_facts("with the next view", after_mm, None))
     if guidance.warning:
         rows.insert(0, mark("look", guidance.warning))
@@ -60,7 +60,9 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
 
 
 def error_lines(known: Known, width: int, height: int) -> Content:
-    """Write the predicted error and the goal; draw the error after each pose."""
+    """Write the predicted error and the goal; draw the error after each pose. A drift check has neither."""
+    if known.shown.session.check:
+        return dim("A drift check: when all images are taken, they judge the installed calibration.")
     estimate, poses, goal = known.shown.estimate, known.shown.session.poses, known.goal_mm
     head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:

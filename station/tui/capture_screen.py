@@ -21,6 +21,7 @@ from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 
 BACK = "Backspace takes the last view back"
+ERROR_LEGEND = "after each pose: █ by images  : planned"
 
 
 class CaptureScreen(StationScreen):
@@ -38,12 +39,7 @@ class CaptureScreen(StationScreen):
                 yield Line(lambda known, _: quality_line(known.shown.detection), id="quality")
             with Vertical(id="live-right"):
                 yield Panel("Poses", progress_lines, id="progress", below=LEGEND)
-                yield Panel(
-                    "Predicted error",
-                    error_lines,
-                    id="error",
-                    below="after each pose: █ by images  : planned",
-                )
+                yield Panel("Predicted error", error_lines, id="error", below=ERROR_LEGEND)
                 yield Panel("Where the board was seen", coverage_lines, id="coverage", below="images")
         yield Stopped(id="stopped")
 
@@ -69,6 +65,9 @@ class CaptureScreen(StationScreen):
         progress.heading = "By hand" if by_hand else "Poses"
         if not by_hand and session.current is not None and status.state in RUNNING:
             progress.heading = f"Pose {session.current + 1} of {len(session.poses)}"
+        error = self.query_one("#error", Panel)
+        error.heading = "Drift check" if session.check else "Predicted error"
+        error.border_subtitle = "" if session.check else ERROR_LEGEND
         self.draw_panels(known)
         self.query_one("#picture").border_title = (
             f"Camera  {status.camera.model}"

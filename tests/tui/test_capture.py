@@ -82,6 +82,8 @@ def test_the_error_falls_towards_its_goal() -> None:
     assert any(line.startswith(" 1.00 ") for line in lines)
     enough = msgspec.structs.replace(status, estimate=msgspec.structs.replace(estimate, enough=True))
     assert "✓ goal 1 mm" in error_lines(Known(enough, configuration=CELL), 60, 14).plain
+    check = in_session(enough, poses=poses, check=True)
+    assert "mm" not in error_lines(Known(check, configuration=CELL), 60, 14).plain
 
 
 def test_columns_stay_in_their_room_whatever_they_are_given() -> None:

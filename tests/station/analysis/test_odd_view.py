@@ -1,4 +1,4 @@
-"""Views by hand against each other: a wrong number, and a wrong way of reading all of them."""
+"""Views against each other: the error that they leave, a wrong number, a wrong way of reading all of them."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from station.analysis.estimation import running_estimate
 from station.analysis.found_cell import FEWEST, find_cell, odd_view
 from station.analysis.worker import CapturedView
 from station.simulation.cells import cell_config, make_cell
+from station.simulation.truth import CellTruth
 from tests.station.quick_plan import quick_plan
 
 POSE_NOISE, PIXEL_NOISE = 1e-4, 0.1
@@ -33,24 +34,44 @@ def w_first(T: Array) -> Array:
     return changed
 
 
+def views_of(truth: CellTruth, count: int, pose_noise: float = POSE_NOISE) -> list[CapturedView]:
+    """Of an arm with this noise, m and rad."""
+    places = quick_plan(cell_config(truth), truth, seed=3, count=count).poses
+    flanges = [np.array(place.base_from_flange) for place in places]
+    points, rng = board_points(truth.board), np.random.default_rng(2)
+    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
+    boards = [board_in_camera(truth.mount, flange, X, Y) for flange in flanges]
+    return [
+        CapturedView(
+            index,
+            perturb(flange, rng.normal(0, pose_noise, 6)),
+            np.arange(len(points)),
+            project_pixels(truth.camera, transform_points(board, points))
+            + rng.normal(0, PIXEL_NOISE, (len(points), 2)),
+        )
+        for index, (flange, board) in enumerate(zip(flanges, boards, strict=True))
+    ]
+
+
+def test_the_predicted_error_is_that_of_the_arm_at_hand_not_of_a_usual_one() -> None:
+    truth, predicted = make_cell("paper-binned", seed=3), []
+    for pose_noise in (3e-5, 3e-3):
+        views = views_of(truth, 15, pose_noise)
+        estimate = running_estimate(cell_config(truth), truth.camera, True, views)
+        assert estimate.predicted_error_mm is not None and estimate.working_distance_m is not None
+        point = np.array([[0.0, 0.0, estimate.working_distance_m]])
+        found, true = (np.array(X) for X in (estimate.camera_pose, truth.camera_mount))
+        off_mm = 1000 * np.linalg.norm(transform_points(found, point) - transform_points(true, point))
+        predicted.append(estimate.predicted_error_mm)
+        assert off_mm < 3 * predicted[-1] and estimate.enough is (predicted[-1] <= 1.0)
+    assert predicted[1] > 5 * predicted[0]
+
+
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_what_cannot_be_is_named_and_what_can_is_not(mount: Mount) -> None:
     truth = make_cell("paper-binned", seed=3, mount=mount)
     blank = msgspec.structs.replace(truth.camera, matrix=None, distortion=())
-    places = quick_plan(cell_config(truth), truth, seed=3, count=FEWEST + 1).poses
-    flanges = [np.array(place.base_from_flange) for place in places]
-    points, rng = board_points(truth.board), np.random.default_rng(2)
-    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
-    seen = [
-        CapturedView(
-            index,
-            perturb(flange, rng.normal(0, POSE_NOISE, 6)),
-            np.arange(len(points)),
-            project_pixels(truth.camera, transform_points(board_in_camera(mount, flange, X, Y), points))
-            + rng.normal(0, PIXEL_NOISE, (len(points), 2)),
-        )
-        for index, flange in enumerate(flanges)
-    ]
+    seen = views_of(truth, FEWEST + 1)
 
     def changed(count: int, change: Callable[[Array], Array], at: slice) -> list[CapturedView]:
         views = seen[:count]

@@ -212,7 +212,7 @@ class ApprovalConfig(Section, frozen=True):
     persons: tuple[str, ...] = ()
     """Names of users who may approve motion at a terminal; empty: all who may connect."""
     services: tuple[str, ...] = ()
-    """Names of users whose programs may approve a plan by its hash, without a terminal."""
+    """Names of users whose programs may approve a plan by the hash of plan and cell, without a terminal."""
 
 
 class StationConfig(Section, frozen=True):

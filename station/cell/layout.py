@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import msgspec
@@ -34,7 +35,7 @@ from station.cell.config import (
     vector6,
 )
 from station.cell.errors import ConfigError, LimitError
-from station.cell.pose_plan import PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
@@ -185,6 +186,17 @@ def cell_geometry(config: StationConfig) -> CellGeometry:
             watched = tuple(vector3(p) for p in transform_points(Y, printed_corners(config.board)))
     model = with_near_axes(arm_model(config.robot))
     return CellGeometry(model, limits, solids, obstacles, clearance, watched, config.mount)
+
+
+def approval_sha256(plan: Plan, config: StationConfig) -> str:
+    """Compute the hash that an approval names: of a plan, the arm, and all that its path is checked by.
+
+    Whatever `cell_geometry` reads belongs into it.
+    """
+    robot = (config.robot.model, config.robot.serial, config.robot.kinematics)
+    places = (config.mount, config.camera_guess, config.board, config.board_guess)
+    content = msgspec.json.encode((plan, robot, places, config.limits), order="deterministic")
+    return hashlib.sha256(content).hexdigest()
 
 
 def camera_body(parent_from_camera: Array, radius_m: float) -> Capsule:

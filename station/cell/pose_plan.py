@@ -62,5 +62,5 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
 
 
 def plan_sha256(plan: Plan) -> str:
-    """Compute the hash, to which an approval is bound, of everything that decides the motion."""
+    """Compute the hash by which recordings and calibrations name a plan."""
     return hashlib.sha256(msgspec.json.encode(plan, order="deterministic")).hexdigest()

@@ -288,7 +288,8 @@ class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
     token: str
     purpose: str
     """Purpose: 'run plan', 'retake pose 7', 'drift check of the installed calibration' …"""
-    plan_sha256: str
+    approval_sha256: str
+    """Hash that an approval names: of the plan, and of the cell in which its path was checked."""
     poses: int
     path_m: float
     """Length of the flange's path."""

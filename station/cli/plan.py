@@ -19,7 +19,7 @@ from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError, RefusedError, StationError
-from station.cell.layout import cell_geometry, require_kept_clear
+from station.cell.layout import approval_sha256, cell_geometry, require_kept_clear
 from station.cell.limits import PlanCheck, Problem, check_plan
 from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.socket_folder import default_socket
@@ -72,7 +72,7 @@ def plan_command(
             save_plan(plan, output)
     outcome = check_plan(plan, standing, cell_geometry(cell))
     if as_json:
-        print_json(_summary(plan, outcome))
+        print_json(_summary(plan, cell, outcome))
     else:
         _show(plan, outcome, cell.capture.goal_m)
         if output is not None and check is None:
@@ -122,6 +122,8 @@ class PlanJson(msgspec.Struct, frozen=True):
     """`station plan --json`"""
 
     plan_sha256: str
+    approval_sha256: str
+    """Of plan and cell, for `station capture --headless --approve`."""
     poses: int
     robot: str
     mount: Mount
@@ -134,10 +136,11 @@ class PlanJson(msgspec.Struct, frozen=True):
     problems: list[Problem]
 
 
-def _summary(plan: Plan, outcome: PlanCheck) -> PlanJson:
+def _summary(plan: Plan, cell: StationConfig, outcome: PlanCheck) -> PlanJson:
     last = plan.predicted_error_m(-1)
     return PlanJson(
         plan_sha256=plan_sha256(plan),
+        approval_sha256=approval_sha256(plan, cell),
         poses=len(plan.poses),
         robot=plan.robot,
         mount=plan.mount,

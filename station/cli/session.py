@@ -57,7 +57,7 @@ class Attended:
     async def approves(self, preview: MotionPreview) -> bool:
         """By the approved hash, by the person, or, for a simulated cell only, by nobody."""
         if self._approved:
-            yes = preview.plan_sha256.startswith(self._approved) and len(self._approved) >= HASH_DIGITS
+            yes = preview.approval_sha256.startswith(self._approved) and len(self._approved) >= HASH_DIGITS
             if not yes:
                 raise RefusedError("other-plan")
         elif self.interactive:
@@ -186,7 +186,7 @@ def session_progress(console: Console, quiet: bool, before: StationStatus) -> It
         yield show
 
 
-Approve = Annotated[str, typer.Option("--approve", help="Hash of the approved plan, 12 digits or more")]
+Approve = Annotated[str, typer.Option("--approve", help="Hash of approved plan and cell, 12 digits or more")]
 
 
 def capture_command(
@@ -199,8 +199,8 @@ def capture_command(
     """Capture the poses of a plan. Ctrl-C stops the arm.
 
     Shows what would move and asks. Next: `calibrate solve RECORDING`. With nobody there a real arm needs
-    `--headless --approve HASH`: the hash that `station plan --json` prints, given as a user that the
-    configuration names in approval.services.
+    `--headless --approve HASH`: approval_sha256 of `station plan --config FILE --json`, of plan and cell,
+    given as a user that the configuration names in approval.services.
 
     Exit codes: 0 all poses captured, 1 failed or stopped, 2 usage, 3 poses missing.
     """

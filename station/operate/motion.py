@@ -27,7 +27,7 @@ PlansHere = Callable[[StationError], Awaitable[bool]]
 REPLACEABLE: Criterion = "A"
 """Criterion of plans that may be replaced by a new one; taught or listed poses never are."""
 HASH_DIGITS = 12
-"""Digits of a plan's hash that are shown, and the fewest accepted for an approval."""
+"""Digits of the hash of plan and cell that are shown, and the fewest accepted for an approval."""
 CONNECT_WAIT_S = 30.0
 PREPARE_S = 200.0
 """Time-out of a preflight check, which may plan poses: up to minutes on a busy computer."""
@@ -81,7 +81,7 @@ async def prepared_motion(
     preview = msgspec.structs.replace(preview, warnings=(*warnings, *preview.warnings))
     if not await approve(preview):
         return False
-    await link.call(Go(preview.token, preview.plan_sha256))
+    await link.call(Go(preview.token, preview.approval_sha256))
     return True
 
 
@@ -94,7 +94,7 @@ def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
         ("Distance", f"{preview.path_m:.2f} m of flange path, largest joint turn {turn_deg:.0f}°"),
         ("Speed", f"up to {preview.top_speed_m_s:.2f} m/s at any point of arm, tool and camera"),
         ("Duration", f"about {preview.duration_s // 60:.0f}:{preview.duration_s % 60:02.0f} min"),
-        ("Plan", preview.plan_sha256[:HASH_DIGITS]),
+        ("Hash", f"{preview.approval_sha256[:HASH_DIGITS]} of plan and cell"),
         *(("WARNING", warning) for warning in preview.warnings),
     ]
 

@@ -103,7 +103,6 @@ class Welcome(msgspec.Struct, frozen=True):
 class LoadedPlan(msgspec.Struct, frozen=True, omit_defaults=True):
     plan: Plan | None = None
     """The loaded plan; None: there is none."""
-    sha256: str = ""
 
 
 class PreviewImage(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -246,7 +245,7 @@ class Go(Verb[Done], frozen=True):
     states = RESTING
     moves = True
     token: str
-    plan_sha256: str = ""
+    approval_sha256: str = ""
 
 
 class Pause(Verb[Done], frozen=True):

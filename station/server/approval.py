@@ -94,17 +94,17 @@ class ApprovalRule:
             "no-terminal", what=what, advice="A person must review and approve it there (docs: Safety)."
         )
 
-    def approve(self, asks: Peer, plan_sha256: str, offered_sha256: str) -> str:
-        """Check as `by_person`, or that a configured service names the hash of the offered plan."""
-        if plan_sha256 and offered_sha256 and plan_sha256 != offered_sha256:
+    def approve(self, asks: Peer, sha256: str, offered_sha256: str) -> str:
+        """Check as `by_person`, or that a configured service names the hash of what is offered."""
+        if sha256 and offered_sha256 and sha256 != offered_sha256:
             raise RefusedError("other-plan")
         if self._simulated or self.terminal(asks):
             return self.by_person(asks, "A move")
         if asks.user not in self._config.services:
             raise RefusedError("no-service", user=asks.user)
-        if not plan_sha256:
+        if not sha256:
             raise RefusedError("no-plan-named", user=asks.user)
-        return "as a service, by the plan's hash"
+        return "as a service, by the hash of plan and cell"
 
     def terminal(self, asks: Peer) -> str:
         """Name the terminal in whose foreground this client's person sees it; empty: none."""

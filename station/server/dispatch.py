@@ -96,7 +96,7 @@ class SessionDispatcher:
                 await session.acknowledge(caller.who)
             case verbs.GetPlan():
                 queue = context.queue
-                return verbs.LoadedPlan(queue.plan, queue.sha256) if queue else verbs.LoadedPlan()
+                return verbs.LoadedPlan(queue.plan if queue else None)
             case verbs.LoadPlan():
                 session.load_plan(client, verb.plan)
             case verbs.MakePlan():
@@ -106,7 +106,7 @@ class SessionDispatcher:
                     self._rule.by_person(await self._named(caller), "A stop test")
                 return await session.prepare(client, verb.purpose, verb.stop_test)
             case verbs.Go():
-                approval = await self._approval(caller, verb.plan_sha256)
+                approval = await self._approval(caller, verb.approval_sha256)
                 await session.go(client, verb.token, approval)
             case verbs.Pause():
                 session.pause(caller.who)
@@ -126,13 +126,13 @@ class SessionDispatcher:
                 return await checklist(context, session.devices.troubles)
         return None
 
-    async def _approval(self, caller: Peer, plan_sha256: str) -> str:
+    async def _approval(self, caller: Peer, sha256: str) -> str:
         """Check that this client may approve what is offered; return who did, and how."""
         asks, waiting = await self._named(caller), self._session.approvals.waiting
         if waiting is not None and waiting.motion.stop_test is not None:
             how = self._rule.by_person(asks, "A stop test")
         else:
-            how = self._rule.approve(asks, plan_sha256, waiting.preview.plan_sha256 if waiting else "")
+            how = self._rule.approve(asks, sha256, waiting.preview.approval_sha256 if waiting else "")
         return f"motion approved by {caller.who}, {how}"
 
     async def _named(self, caller: Peer) -> Peer:

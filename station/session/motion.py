@@ -23,7 +23,7 @@ from station.analysis.worker import check_run
 from station.cell.arm_acceptance import StopTestMove
 from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError
-from station.cell.layout import arm_model, require_kept_clear
+from station.cell.layout import approval_sha256, arm_model, require_kept_clear
 from station.cell.limits import PlanCheck
 from station.cell.pose_plan import Plan
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
@@ -95,7 +95,7 @@ async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
     return MotionPreview(
         token=secrets.token_urlsafe(16),
         purpose=_purpose_words(context, motion),
-        plan_sha256=queue.sha256,
+        approval_sha256=approval_sha256(queue.plan, context.cell.config),
         poses=len(poses),
         path_m=round(check.path_m, 3),
         largest_step_rad=round(check.largest_step_rad, 4),
@@ -192,7 +192,7 @@ class MotionApproval:
     @property
     def said(self) -> str:
         """Text on the approval for log and recording."""
-        return f"{self.approval}: {self.preview.purpose}, plan {self.preview.plan_sha256[:12]}"
+        return f"{self.approval}: {self.preview.purpose}, plan and cell {self.preview.approval_sha256[:12]}"
 
 
 class ApprovalManager:
@@ -212,9 +212,7 @@ class ApprovalManager:
         self.voids += 1
         self.waiting = None
 
-    def redeem(
-        self, token: str, client_id: int, plan_sha256: str, joints_rad: Sequence[float]
-    ) -> MotionApproval:
+    def redeem(self, token: str, client_id: int, sha256: str, joints_rad: Sequence[float]) -> MotionApproval:
         """Return the approval, once. RefusedError when anything changed since the offer, then void."""
         asked, self.waiting = self.waiting, None
         if asked is None or not secrets.compare_digest(asked.preview.token.encode(), token.encode()):
@@ -224,7 +222,7 @@ class ApprovalManager:
         if asked.client_id != client_id:
             raise RefusedError("approval-of-another")
         # A stop test does not depend on the plan. A new session's poses have the hash of those shown so far.
-        if asked.motion.stop_test is None and asked.preview.plan_sha256 != plan_sha256:
+        if asked.motion.stop_test is None and asked.preview.approval_sha256 != sha256:
             raise RefusedError("plan-changed")
         require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")
         return asked

@@ -19,6 +19,7 @@ from recordings.errors import RecordingError
 from station.analysis.pool import Workers
 from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import RefusedError, RobotError, StationError
+from station.cell.layout import approval_sha256
 from station.cell.pose_plan import Plan
 from station.cell.session_folder import interrupted_session
 from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
@@ -222,9 +223,10 @@ class Session:
         self._require_run_ended()
         if self.freedrive.taking:
             raise RefusedError("still-ending", what="freedrive")
-        plan_sha256 = context.queue.sha256 if context.queue else ""
+        queue = context.queue
+        sha256 = approval_sha256(queue.plan, context.cell.config) if queue else ""
         try:
-            go = self.approvals.redeem(token, client_id, plan_sha256, joints)
+            go = self.approvals.redeem(token, client_id, sha256, joints)
             go = replace(go, approval=approval or f"motion approved by {self.store.status.lease.holder}")
         finally:
             self.store.update(go=None)
@@ -237,7 +239,7 @@ class Session:
                 context.queue = motion.queue
                 context.show_poses()
         self.store.enter(StationState.CHECKING)
-        self.store.event("approved", go.said, plan_sha256=go.preview.plan_sha256)
+        self.store.event("approved", go.said, approval_sha256=go.preview.approval_sha256)
         self._run = asyncio.create_task(run.drive())
 
     def pause(self, who: str) -> None:

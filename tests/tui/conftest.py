@@ -48,7 +48,7 @@ from tests.recordings.small_recording import make_state
 SUMMARY = MotionPreview(
     token="t-1",
     purpose="run plan",
-    plan_sha256="ab" * 32,
+    approval_sha256="ab" * 32,
     poses=25,
     path_m=4.2,
     largest_step_rad=0.7,

@@ -35,7 +35,7 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
         warning = next(i for i, line in enumerate(facts.splitlines()) if line.startswith("WARNING"))
         assert facts.splitlines()[warning + 1].startswith(" " * 10 + "0")  # a long fact goes on below itself
         await pilot.click("#yes")
-        await until(pilot, lambda: verbs.Go("t-1", SUMMARY.plan_sha256) in link.asked)
+        await until(pilot, lambda: verbs.Go("t-1", SUMMARY.approval_sha256) in link.asked)
         await until(pilot, lambda: pilot.app.current_mode == "capture")  # where the work is watched
 
 

@@ -13,7 +13,8 @@ from calibrate.geometry import pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
 from station.cell.collision import CellGeometry, body_segments, segment_distance
 from station.cell.config import Capsule, KinematicsDeltas, PoseGuess
-from station.cell.layout import cell_geometry, guess_from, require_kept_clear
+from station.cell.layout import approval_sha256, cell_geometry, guess_from, require_kept_clear
+from station.cell.pose_plan import Plan
 from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 
@@ -44,6 +45,28 @@ def covers(rods: tuple[Capsule, ...], place: Any) -> bool:
     points = transform_points(place, np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3))
     gaps = [segment_distance(points, points, np.array(r.from_m), np.array(r.to_m)) - r.radius_m for r in rods]
     return bool(np.min(gaps, axis=0).max() <= 1e-9)
+
+
+def test_an_approval_is_of_the_plan_in_this_cell() -> None:
+    plan, config = Plan("UR10", "eye-in-hand", ()), config_of("eye-in-hand")
+    limits, robot = config.limits, config.robot
+    elsewhere = msgspec.structs.replace(config.board_guess, translation_m=(0.1, 0.2, 0.3))
+    tool = Capsule("tool", (0.0, 0.0, 0.0), (0.0, 0.0, 0.2), 0.05)
+    others = [
+        {"limits": msgspec.structs.replace(limits, speed_m_s=0.1)},
+        {"limits": msgspec.structs.replace(limits, planes=())},
+        {"limits": msgspec.structs.replace(limits, solids=(tool,))},
+        {"board_guess": elsewhere},
+        {"board": msgspec.structs.replace(config.board, square_m=0.03)},
+        {"robot": msgspec.structs.replace(robot, serial="20195501234")},
+        {"robot": msgspec.structs.replace(robot, kinematics=KinematicsDeltas(a_m=(0.001,) * 6))},
+    ]
+    cells = [config, *(msgspec.structs.replace(config, **other) for other in others)]
+    plans = [plan, msgspec.structs.replace(plan, joint_speed_rad_s=0.5)]
+    assert len({approval_sha256(a, cell) for a in plans for cell in cells}) == len(plans) * len(cells)
+    elsewhere_served = msgspec.structs.replace(robot, host="192.0.2.7")
+    same = msgspec.structs.replace(config, name="other", robot=elsewhere_served)
+    assert approval_sha256(plan, same) == approval_sha256(plan, config)
 
 
 def test_a_camera_on_the_flange_and_a_board_in_the_cell() -> None:

@@ -19,12 +19,10 @@ import typer
 
 from recordings.errors import CodedError, ErrorReport
 from station.cell.errors import StationError
-from station.cell.pose_plan import plan_sha256
 from station.cell.status import MotionPreview
 from station.cli import daemon, main, session
 from station.cli.app import STATION
 from station.cli.daemon import ensure_daemon, own_daemon, tell_what_goes_on
-from station.plan.files import load_plan
 from station.protocol.client import DaemonGoneError
 from station.protocol.states import RUNNING
 from tests.codes import raises
@@ -73,7 +71,7 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
 
     assert shell.refused("capture", "--plan", str(plan), "--headless", "--approve", "ab" * 32) == "other-plan"
 
-    sha = plan_sha256(load_plan(plan))
+    sha = json.loads(shell("plan", "--check", str(plan), "--json")[1])["approval_sha256"]
     code, out, err = shell.ask("capture", "--plan", str(plan), "--headless", "--approve", sha[:12], "--json")
     assert code in (0, 3), out + err
     result = json.loads(out)

@@ -71,7 +71,7 @@ async def test_a_plan_that_was_never_run_is_named_before_it_is_replaced(
     link, person = FakeLink(), Person()
     assert await start_drift_check(link, loaded(*attempts), person.approves)
     assert bool(person.shown.warnings) is named
-    assert link.asked[-1] == verbs.Go("t", PREVIEW.plan_sha256)
+    assert link.asked[-1] == verbs.Go("t", PREVIEW.approval_sha256)
 
 
 @pytest.mark.parametrize("refused", [None, verbs.Prepare, verbs.Go])

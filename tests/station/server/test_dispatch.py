@@ -20,7 +20,8 @@ import pytest
 from recordings.reader import open_recording
 from station.cell.config import ApprovalConfig
 from station.cell.errors import RefusedError
-from station.cell.pose_plan import Plan, plan_sha256
+from station.cell.layout import approval_sha256
+from station.cell.pose_plan import Plan
 from station.cell.socket_folder import user_name
 from station.cell.status import StationState
 from station.protocol.client import Client
@@ -59,7 +60,7 @@ async def served(new_rig: NewRig, tmp_path: Path) -> AsyncIterator[Served]:
 async def test_a_capture_over_the_socket(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna:
         await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
-        assert (await anna.request("plan"))["sha256"] == plan_sha256(small_plan)
+        assert (await anna.request("plan"))["plan"]["poses"][0]["name"] == small_plan.poses[0].name
         lease = served.rig.session.store.status.lease
         assert lease.client_id == anna.own_id and lease.holder.startswith(ME)
         summary = await anna.request("prepare", purpose="run")
@@ -118,7 +119,7 @@ async def test_a_screen_at_which_nobody_is_may_say_that_it_is_lost(served: Serve
         await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
         served.rig.arm.slow = True
         offer = await anna.request("prepare")
-        await anna.request("go", token=offer["token"], plan_sha256=offer["plan_sha256"])
+        await anna.request("go", token=offer["token"], approval_sha256=offer["approval_sha256"])
         await served.rig.until(StationState.MOVING)
         await anna.request("release", silent=True)
         assert served.rig.state is StationState.PAUSED
@@ -185,19 +186,20 @@ async def test_a_program_cannot_approve_motion_of_a_real_arm_whatever_it_says(
     async with await served.client() as program:
         with raises("wrong-arguments"):
             await program.request("hello", who=f"{ME} on tty1")
-        for named in ({}, {"plan_sha256": plan_sha256(small_plan)}):
+        sha256 = approval_sha256(small_plan, served.rig.session.context.cell.config)
+        for named in ({}, {"approval_sha256": sha256}):
             summary = await offered(program, small_plan)
             with pytest.raises(RefusedError) as refused:
                 await program.request("go", token=summary["token"], **named)
             said = msgspec.json.encode(refused.value.data).decode()
-            assert summary["token"] not in said and plan_sha256(small_plan)[:12] not in said
+            assert summary["token"] not in said and sha256[:12] not in said
         with raises("no-terminal"):
             await program.request("prepare", purpose="stop-test", stop_test=STOP_TEST)
     assert "move" not in served.rig.arm.log and "start control" not in served.rig.arm.log
     await served.control.close()
 
 
-async def test_a_named_service_approves_by_the_plans_hash_and_is_written_down(
+async def test_a_named_service_approves_by_the_hash_of_plan_and_cell_and_is_written_down(
     new_rig: NewRig, small_plan: Plan, tmp_path: Path
 ) -> None:
     served = await real_cell(new_rig, tmp_path, with_none, ApprovalConfig(services=(ME,)))
@@ -205,20 +207,23 @@ async def test_a_named_service_approves_by_the_plans_hash_and_is_written_down(
     async with await served.client() as program:
         with raises("no-terminal"):
             await program.request("prepare", purpose="stop-test", stop_test=STOP_TEST)
-        for wrong in ({}, {"plan_sha256": "ab" * 32}):
+        cell = session.context.cell.config
+        slower = msgspec.structs.replace(cell, limits=msgspec.structs.replace(cell.limits, speed_m_s=0.1))
+        sha256, of_another = (approval_sha256(small_plan, config) for config in (cell, slower))
+        for wrong in ({}, {"approval_sha256": "ab" * 32}, {"approval_sha256": of_another}):
             summary = await offered(program, small_plan)
             with pytest.raises(RefusedError):
                 await program.request("go", token=summary["token"], **wrong)
         assert "move" not in served.rig.arm.log
         summary = await offered(program, small_plan)
-        await program.request("go", token=summary["token"], plan_sha256=plan_sha256(small_plan))
+        await program.request("go", token=summary["token"], approval_sha256=sha256)
         await until(lambda: bool(session.store.status.session.recording))
     told = [event.text for event in served.rig.told("approved")]
     recording = open_recording(Path(session.store.status.session.recording))
     recorded = [event.detail for event in recording.events() if "approved by" in event.detail]
     for texts in (told, recorded):
         assert len(texts) == 1 and ME in texts[0] and f"pid {os.getpid()}" in texts[0]
-        assert "service" in texts[0] and plan_sha256(small_plan)[:12] in texts[0]
+        assert "service" in texts[0] and sha256[:12] in texts[0]
     await served.control.close()
 
 

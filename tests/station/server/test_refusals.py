@@ -44,7 +44,7 @@ def test_every_verb_that_depends_on_a_state_is_tried_here() -> None:
 async def test_a_verb_out_of_its_state_is_refused_and_changes_nothing(
     rig: Rig, small_plan: Plan, monkeypatch: pytest.MonkeyPatch, verb: str
 ) -> None:
-    monkeypatch.setattr(rig.session.supervisor, "_look", lambda: None)  # it would correct the state
+    monkeypatch.setattr(rig.session.supervisor, "_watch_link", lambda: None)  # it would correct the state
     dispatcher, store = SessionDispatcher(rig.session), rig.session.store
     calm, done = store.status, list(rig.arm.log)
     for state in set(S) - VERBS[verb].states:

@@ -104,7 +104,7 @@ def session(task: tuple[str, Mount, int]) -> tuple[float, ...]:
 def enough(taken: ViewSet, wanted: NextView) -> bool:
     if len(taken) < FEWEST_BY_HAND or (found := wanted.found) is None:
         return False
-    covariance = quick_covariance(found.views, BOARD, found.X, found.Y, True, found.noise)
+    covariance = quick_covariance(found, BOARD, True)
     distance_m = median_distance_m(found.views.camera_from_board)
     return point_error_m(found.X, covariance, distance_m) <= CaptureConfig().goal_m
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,11 +14,11 @@ import numpy as np
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, inverse, pose, project_to_rotation
+from calibrate.geometry import Array
 from calibrate.handeye.information import covariance_of, prior_information, view_information
 from calibrate.handeye.metrics import median_distance_m, point_error_m
 from calibrate.handeye.noise_scales import MeasurementNoise
-from calibrate.handeye.pose_fit import fit_poses, pose_views
+from calibrate.handeye.pose_fit import PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
@@ -55,30 +55,56 @@ def running_estimate(
     if len(seen) < FEWEST_FOR_ESTIMATE:
         return blank
     try:
-        views, X, Y = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
-        noise = measured_noise(views, config.board)
-        covariance = quick_covariance(views, config.board, X, Y, not lens_is_known, noise)
+        quick = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
+        covariance = quick_covariance(quick, config.board, not lens_is_known)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return blank
-    distance_m = median_distance_m(views.camera_from_board)
-    error_m = point_error_m(X, covariance, distance_m)
+    distance_m = median_distance_m(quick.views.camera_from_board)
+    error_m = point_error_m(quick.X, covariance, distance_m)
     return msgspec.structs.replace(
         blank,
-        camera_pose=matrix4(X),
-        board_pose=matrix4(Y),
+        camera_pose=matrix4(quick.X),
+        board_pose=matrix4(quick.Y),
         predicted_error_mm=round(1000 * error_m, 3),
         working_distance_m=round(distance_m, 4),
         enough=error_m <= config.capture.goal_m,
     )
 
 
+@dataclass(frozen=True, eq=False)
+class QuickFit:
+    """Fit of the views as poses, in some 50 ms."""
+
+    views: ViewSet
+    """With the lens that was used, and the board's pose in each image."""
+    poses: PoseViews
+    fit: PoseFit
+
+    @property
+    def X(self) -> Array:
+        """flange_from_camera (eye-in-hand) or base_from_camera, (4, 4)"""
+        return np.asarray(self.fit.X[0])
+
+    @property
+    def Y(self) -> Array:
+        """base_from_board (eye-in-hand) or flange_from_board, (4, 4)"""
+        return np.asarray(self.fit.Y[0])
+
+    @property
+    def boards(self) -> Array:
+        """camera_from_board (n, 4, 4), with focal length and board size as fitted."""
+        return self.poses.boards.at(self.fit.factors)
+
+    @property
+    def noise(self) -> MeasurementNoise:
+        """By how far the views agree: a coarse arm, or poor light, is not taken for a usual one."""
+        return MeasurementNoise(self.poses.corner_px, *self.fit.solved.scales.robot.tolist())
+
+
 def solve_quickly(
     mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[CapturedView]
-) -> tuple[ViewSet, Array, Array]:
-    """Estimate quickly; return the views with the lens used, X (4, 4) and Y (4, 4).
-
-    CalibrationError, cv2.error or LinAlgError when the views are degenerate.
-    """
+) -> QuickFit:
+    """Fit the views quickly. CalibrationError, cv2.error or LinAlgError when they are degenerate."""
     views = as_views(mount, camera, board, seen)
     if camera.matrix is None:
         views = replace(views, camera=calibrate_intrinsics(views).camera)
@@ -86,7 +112,8 @@ def solve_quickly(
         with contextlib.suppress(CalibrationError):  # else keep the rough lens
             views = replace(views, camera=calibrate_intrinsics(views).camera)
     views = solve_pnp(views, board)
-    return views, *_quick_solution(views)
+    poses = pose_views(views, FOCAL_SIGMA, BoardTolerance.of(board).square)
+    return QuickFit(views, poses, fit_poses(poses))
 
 
 def as_views(mount: Mount, camera: CameraModel, board: BoardSpec, seen: Sequence[CapturedView]) -> ViewSet:
@@ -96,41 +123,11 @@ def as_views(mount: Mount, camera: CameraModel, board: BoardSpec, seen: Sequence
     return ViewSet(mount, tuple(found), camera)
 
 
-def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
-    """Compute X and Y in closed form (Park & Martin 1994, by OpenCV) from all views."""
-    flange, board = views.base_from_flange, views.camera_from_board
-    gripper = flange if views.mount == "eye-in-hand" else inverse(flange)
-    R, t = cv2.calibrateHandEye(
-        list(gripper[:, :3, :3]),
-        list(gripper[:, :3, 3]),
-        list(board[:, :3, :3]),
-        list(board[:, :3, 3]),
-        method=cv2.CALIB_HAND_EYE_PARK,
-    )
-    if not np.isfinite(R).all() or not np.isfinite(t).all():
-        raise np.linalg.LinAlgError("no finite solution")
-    # Of views that contradict each other OpenCV's R may be a mirror, which is no pose to record.
-    X = pose(project_to_rotation(np.asarray(R)), np.asarray(t).ravel())
-    return X, np.asarray(gripper[0] @ X @ board[0])
-
-
-def measured_noise(views: ViewSet, board: BoardSpec) -> MeasurementNoise:
-    """Measure the noise of corners and robot by how far the views agree. Raises LinAlgError.
-
-    The solution states its error by the same: a coarse arm, or poor light, is not taken for a usual one.
-    """
-    poses = pose_views(views, FOCAL_SIGMA, BoardTolerance.of(board).square)
-    robot_m, robot_rad = fit_poses(poses).solved.scales.robot.tolist()
-    return MeasurementNoise(poses.corner_px, robot_m, robot_rad)
-
-
-def quick_covariance(
-    views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool, noise: MeasurementNoise
-) -> Array:
+def quick_covariance(quick: QuickFit, board: BoardSpec, free_lens: bool) -> Array:
     """Predict the covariance (6, 6) of X. LinAlgError where X and Y put the board out of sight."""
-    points = board_points(board)
+    views, points = quick.views, board_points(board)
     flange = views.base_from_flange
-    each = view_information(views.mount, views.camera, flange, X, Y, points, noise)
+    each = view_information(views.mount, views.camera, flange, quick.X, quick.Y, points, quick.noise)
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
     covariance = covariance_of(each.sum(axis=0), prior)[:6, :6]
     if not np.isfinite(covariance).all():

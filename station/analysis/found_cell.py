@@ -8,17 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Literal
 
 import cv2
 import numpy as np
 
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, difference, inverse
-from calibrate.handeye.noise_scales import MeasurementNoise
-from calibrate.handeye.pose_fit import fit_poses, pose_views
-from calibrate.handeye.priors import BoardTolerance
+from calibrate.geometry import difference
+from calibrate.handeye.pose_fit import FREE, fit_poses, pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.views import ViewSet, implied_flange
@@ -26,7 +23,7 @@ from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import (
     FEWEST_FOR_CELL,
     FOCAL_SIGMA,
-    measured_noise,
+    QuickFit,
     quick_covariance,
     solve_quickly,
 )
@@ -42,24 +39,14 @@ _MOVED_M = 0.006
 """Spread of the board's position over the views above which it, or the camera, was moved."""
 _WRONG_SCALE = 0.03
 """Relative deviation of the squares from their stated size above which a warning is given."""
-_SCALE_SIGMA, _TRAVEL_M = 0.5, 0.001
-"""Prior 1σ of the scale; 1σ of the arm's travel against the camera's."""
 _OTHER_MOUNT = 3.0
 """Ratio of the fits from which the other mounting is taken to be the right one."""
 
 
 @dataclass(frozen=True, eq=False)
-class FoundCell:
+class FoundCell(QuickFit):
     """Camera, board and mounting estimated from the views."""
 
-    views: ViewSet
-    """With the lens that was used, and the board's pose in each image."""
-    X: Array
-    """flange_from_camera (eye-in-hand) or base_from_camera, (4, 4)"""
-    Y: Array
-    """base_from_board (eye-in-hand) or flange_from_board, (4, 4)"""
-    noise: MeasurementNoise
-    """By the views."""
     sigma_m: float
     sigma_rad: float
     spread_m: float
@@ -110,58 +97,40 @@ def find_cell(
     if len(seen) < FEWEST_FOR_CELL:
         return None
     try:
-        views, X, Y = solve_quickly(mount, camera, lens_known, board, seen)
+        quick = solve_quickly(mount, camera, lens_known, board, seen)
         other: Mount = "eye-to-hand" if mount == "eye-in-hand" else "eye-in-hand"
-        other_views, other_X, _ = solve_quickly(other, views.camera, True, board, seen)
-        noise = measured_noise(views, board)
-        variances = np.diag(quick_covariance(views, board, X, Y, not lens_known, noise))
+        other_m = _spread_m(solve_quickly(other, quick.views.camera, True, board, seen))
+        variances, scale = np.diag(quick_covariance(quick, board, not lens_known)), _scale(quick.views)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None
-    spread_m, other_m = _spread_m(views, X), _spread_m(other_views, other_X)
+    spread_m = _spread_m(quick)
     # Few views give a rough lens, so state at least the disagreement between the views.
     sigma_m = float(np.sqrt(variances[:3].sum() + spread_m**2))
     return FoundCell(
-        views=views,
-        X=X,
-        Y=Y,
-        noise=noise,
+        quick.views,
+        quick.poses,
+        quick.fit,
         sigma_m=max(sigma_m, _LEAST_SIGMA_M),
         sigma_rad=max(float(np.sqrt(variances[3:].sum())), _LEAST_SIGMA_RAD),
         spread_m=spread_m,
-        scale=_scale(views, X),
+        scale=scale,
         other_fits=_OTHER_MOUNT * other_m < spread_m,
     )
 
 
-def _spread_m(views: ViewSet, X: Array) -> float:
+def _spread_m(quick: QuickFit) -> float:
     """Compute the rms distance of the board's positions, by single views, from their mean."""
-    places = board_place(views.mount, views.base_from_flange, X, views.camera_from_board)[:, :3, 3]
+    views = quick.views
+    places = board_place(views.mount, views.base_from_flange, quick.X, quick.boards)[:, :3, 3]
     return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
-def _scale(views: ViewSet, X: Array) -> float:
-    """Estimate the factor on the board's size at which camera and arm move by equal distances.
-
-    AX = XB by translations (Shiu & Ahmad 1989) with t_B times an unknown factor: linear in it and in t_X.
-    Views that only rotate about one point do not determine it, hence the prior 1 ± `_SCALE_SIGMA`.
-    """
-    flange = views.base_from_flange
-    gripper = flange if views.mount == "eye-in-hand" else inverse(flange)
-    left, right = (
-        [np.array([[0.0, 0.0, 0.0, _TRAVEL_M / _SCALE_SIGMA]])],
-        [np.array([_TRAVEL_M / _SCALE_SIGMA])],
-    )
-    for i, j in combinations(range(len(gripper)), 2):
-        A = inverse(gripper[j]) @ gripper[i]
-        B = views.camera_from_board[j] @ inverse(views.camera_from_board[i])
-        left.append(np.hstack([A[:3, :3] - np.eye(3), -(X[:3, :3] @ B[:3, 3])[:, None]]))
-        right.append(-A[:3, 3])
-    rows = np.vstack(left)
-    solution = np.linalg.lstsq(rows, np.concatenate(right), rcond=None)[0]
-    sigma = _TRAVEL_M * float(np.sqrt(np.linalg.inv(rows.T @ rows)[3, 3]))
-    left_m = rows[1:] @ solution - np.concatenate(right[1:])
-    explained = float(np.sqrt((left_m**2).mean())) <= 2 * _TRAVEL_M
-    return float(solution[3]) if explained and abs(solution[3] - 1) > 3 * sigma else 1.0
+def _scale(views: ViewSet) -> float:
+    """Estimate true over stated size of the board; 1 where the views do not tell another."""
+    fit = fit_poses(pose_views(views, FOCAL_SIGMA, FREE))
+    at = len(fit.solved.precision) - len(fit.factors)
+    sigma = float(np.sqrt(np.linalg.inv(fit.solved.precision)[at, at]))
+    return float(fit.factors[0]) if abs(fit.factors[0] - 1) > 3 * sigma else 1.0
 
 
 FEWEST = 6
@@ -191,17 +160,16 @@ def odd_view(
     if len(seen) < FEWEST:
         return None
     try:
-        views, _, _ = solve_quickly(mount, camera, lens_known, board, seen)
-        poses = pose_views(views, FOCAL_SIGMA, BoardTolerance.of(board).square)
-        fit = fit_poses(poses)
+        quick = solve_quickly(mount, camera, lens_known, board, seen)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None
-    if (session := explain_recording(poses)).reading in _WAYS:
+    fit = quick.fit
+    if (session := explain_recording(quick.poses)).reading in _WAYS:
         return StationError("poses-misread", views=len(seen), way=_WAYS[session.reading])
     if fit.full[-1] >= _ORDINARY or fit.full[:-1].mean() < 0.5:
         return None
-    implied = implied_flange(mount, fit.X[0], fit.Y[0], poses.boards.at(fit.factors))[-1]
-    off = difference(views.base_from_flange[-1], implied)
+    implied = implied_flange(mount, quick.X, quick.Y, quick.boards)[-1]
+    off = difference(quick.views.base_from_flange[-1], implied)
     x, y, z = 1000 * off[:3]
     return StationError(
         "odd-view", others=len(seen) - 1, x=x, y=y, z=z, turn=math.degrees(float(np.linalg.norm(off[3:])))

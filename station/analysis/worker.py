@@ -26,11 +26,8 @@ from calibrate.geometry import Array, transform_points
 from calibrate.lens.pnp import planar_tilts
 from calibrate.views import BoardView
 from recordings.images import Pixels, eight_bits, viewable
-from recordings.schema.messages import BoardSpec, CameraModel, Image, Vector6
-from station.cell.config import StationConfig
-from station.cell.layout import cell_geometry
-from station.cell.limits import PlanCheck, check_plan
-from station.cell.pose_plan import ExpectedView, Plan
+from recordings.schema.messages import BoardSpec, CameraModel, Image
+from station.cell.pose_plan import ExpectedView
 from station.cell.process import die_with_parent
 from station.cell.status import DetectionStatus
 from station.protocol.verbs import PreviewImage
@@ -142,11 +139,6 @@ def _distance_and_tilt(
         return None, None
     tilt = float(np.arccos(np.clip(abs(C[2, 2]), 0.0, 1.0)))
     return round(float(np.linalg.norm(transform_points(C, points.mean(axis=0)))), 4), round(tilt, 4)
-
-
-def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> PlanCheck:
-    """Check the whole path of a plan from the arm's present joints (6,), rad."""
-    return check_plan(plan, start_joints_rad, cell_geometry(config))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ import contextlib
 import logging
 from collections.abc import Awaitable, Callable
 
-from station.analysis.pool import WorkerError
 from station.cell.errors import CameraError, RobotError, StationError
 from station.cell.status import CameraStatus, TriggerStatus
 from station.session.context import SessionContext
@@ -28,17 +27,11 @@ class DeviceConnector:
     async def run(self) -> None:
         """Open all devices in parallel."""
         await asyncio.gather(
-            self._start_worker(),
+            self._until_open("worker", self._context.workers.start),
             self._until_open("robot", self._open_robot),
             self._until_open("camera", self._open_camera),
             self._until_open("trigger", self._open_trigger),
         )
-
-    async def _start_worker(self) -> None:
-        try:
-            await self._context.workers.start()
-        except WorkerError as error:
-            log.warning("%s", error)
 
     async def _until_open(self, device: str, opening: Callable[[], Awaitable[None]]) -> None:
         while True:

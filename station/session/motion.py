@@ -19,12 +19,11 @@ from calibrate.kinematics import forward
 from recordings.errors import RecordingError
 from recordings.files import require_free_space
 from recordings.schema.messages import RobotState, Vector6
-from station.analysis.worker import check_run
 from station.cell.arm_acceptance import StopTestMove
 from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError
-from station.cell.layout import approval_sha256, arm_model, require_kept_clear
-from station.cell.limits import PlanCheck
+from station.cell.layout import approval_sha256, arm_model, cell_geometry, require_kept_clear
+from station.cell.limits import PlanCheck, check_plan
 from station.cell.pose_plan import Plan
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
@@ -88,7 +87,7 @@ async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
     start = vector6(state.joints_rad)
     queue, poses = motion.queue, motion.poses
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
-    check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
+    check: PlanCheck = await context.workers.call(check_plan, plan, start, cell_geometry(context.cell.config))
     if check.problems:
         raise await _refused(context, plan, check, start)
     overhead_s = 0.0 if motion.stop_test else POSE_OVERHEAD_S * len(poses)
@@ -121,7 +120,7 @@ async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start:
     if not check.moves or len(check.problems) > len(check.moves[0].problems):
         return refused
     cell, first_rad = context.cell, plan.poses[0].joints_rad
-    if (await context.workers.call(check_run, cell.config, plan, first_rad)).problems:
+    if (await context.workers.call(check_plan, plan, first_rad, cell_geometry(cell.config))).problems:
         return refused
     advice = "Bring the arm to its first pose by hand"
     if plan.criterion is not None:

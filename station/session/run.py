@@ -11,7 +11,6 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.schema.messages import Vector6
-from station.cell.collision import CellGeometry
 from station.cell.config import vector6
 from station.cell.errors import (
     LimitError,
@@ -48,21 +47,21 @@ class Run:
         self._context, self._mover = context, context.cell.require_mover()
         self._go = go
         self._queue = go.motion.queue
-        self._geometry = self._cell_geometry()
+        self._geometry = with_plan_speeds(cell_geometry(context.cell.config), self._queue.plan)
         self._approved_again = 0
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
         """Numbers of poses that did not settle."""
 
-    def _cell_geometry(self) -> CellGeometry:
-        return with_plan_speeds(cell_geometry(self._context.cell.config), self._queue.plan)
-
     async def drive(self) -> None:
         """Carry out the approval, ending in paused, stopped, fault or idle; raises only when cancelled."""
-        while (late := await self._drive_once()) is not None:
-            if not await self._approve_again(late):
-                failed(self._context, late)
-                return
+        try:
+            while (late := await self._drive_once()) is not None:
+                if not await self._approve_again(late):
+                    failed(self._context, late)
+                    return
+        finally:  # whoever waits for its end may begin the next
+            unmark_busy(self._context)
 
     async def _drive_once(self) -> StationError | None:
         """Carry out the approval once; return the error of a delay after which it may go on, else None."""
@@ -87,15 +86,11 @@ class Run:
         or the controller stopped the arm.
         """
         late = error.code in set(Delay) and self._approved_again < APPROVED_AGAIN
-        return late and self._context.cell.own_simulator and self._records and not self._halted
+        return late and self._context.cell.own_simulator and self._records and not self._context.requests.halt
 
     @property
     def _records(self) -> bool:
         return self._go.motion.stop_test is None
-
-    @property
-    def _halted(self) -> bool:
-        return self._context.requests.halt
 
     async def _approve_again(self, late: StationError) -> bool:
         """Approve the remaining poses in a simulated cell; False: not possible."""
@@ -116,7 +111,6 @@ class Run:
         self._approved_again += 1
         said = f"approved by this simulated cell itself, {self._approved_again} of at most {APPROVED_AGAIN}"
         self._go = replace(self._go, motion=motion, preview=preview, approval=said)
-        self._geometry = self._cell_geometry()
         store.update_session(approved_again=count)
         store.event("approved-again", self._go.said, "warning", None, count=count)
         return True
@@ -138,7 +132,7 @@ class Run:
         except (StationError, RecordingError) as error:
             if self._may_go_on(error):
                 raise
-            if not self._halted:
+            if not context.requests.halt:
                 context.store.enter(resting, error)
                 context.store.problem(error, "error", said="not started: {}")
             return False

@@ -91,7 +91,8 @@ class Session:
             self.context.restore(*found)
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
-        loops = (self.supervisor.run, self.devices.run, self._estimator.run, self.freedrive.run)
+        watching = self.supervisor.run, self.supervisor.monitor.watch_files
+        loops = (*watching, self.devices.run, self._estimator.run, self.freedrive.run)
         self._tasks = [asyncio.create_task(self._kept_going(loop)) for loop in loops]
 
     async def _kept_going(self, loop: Callable[[], Awaitable[object]]) -> None:

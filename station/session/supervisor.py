@@ -37,13 +37,10 @@ class Monitor:
     def __init__(self, context: SessionContext) -> None:
         self._context = context
         self._files = _Files()
-        self._reading: asyncio.Task[_Files] | None = None
-        self._read_s = -DISK_PERIOD_S
         moved = context.cell.mover is not None
         self._geometry = cell_geometry(context.cell.config) if moved else None
 
     def refresh(self) -> None:
-        self._watch_files()
         store, notice = self._context.store, self._context.cell.arm.notice
         if store.state is StationState.MOVING:
             store.update(reason=notice)  # such as 'speed slider at 5 %'
@@ -99,16 +96,11 @@ class Monitor:
             return shown
         return msgspec.structs.replace(shown, pulses=box.pulses)
 
-    def _watch_files(self) -> None:
-        """Read files in a thread, as a hanging disk must not delay the heartbeat."""
-        if self._reading is not None:
-            if not self._reading.done():
-                return
-            read, self._reading = self._reading, None
-            self._files = read.result()
-        if (now_s := time.monotonic()) - self._read_s >= DISK_PERIOD_S:
-            self._read_s = now_s
-            self._reading = asyncio.create_task(WATCH.run(_read_files, self._context))
+    async def watch_files(self) -> None:
+        """Read files for the daemon's life, in a thread: a hanging disk must not delay the heartbeat."""
+        while True:
+            self._files = await WATCH.run(_read_files, self._context)
+            await asyncio.sleep(DISK_PERIOD_S)
 
 
 @dataclass(frozen=True)
@@ -134,7 +126,7 @@ class SessionSupervisor:
     def __init__(self, context: SessionContext, lost: Callable[[], None]) -> None:
         """`lost`: called when the arm's states are too late."""
         self._context = context
-        self._monitor = Monitor(context)
+        self.monitor = Monitor(context)
         self._lost = lost
         self.first: Callable[[], None] = lambda: None
         """Called first in every round."""
@@ -164,12 +156,8 @@ class SessionSupervisor:
             mover.heartbeat()
         if number % STATUS_TICKS == 0:
             self._watch_link()
-            self._monitor.refresh()
+            self.monitor.refresh()
         self.ticked()
-
-    def lag_ms(self) -> float:
-        """Return the largest delay of the last second, ms."""
-        return 1000 * max(self.lags_s, default=0.0)
 
     def _watch_link(self) -> None:
         """Switch between idle and disconnected; during a run the run itself detects a lost robot."""
@@ -201,7 +189,7 @@ class SessionSupervisor:
     def _tell_delay(self, since_s: float) -> None:
         """Report what made states of a resting arm late."""
         store, now_s = self._context.store, time.monotonic()
-        late = self._context.cell.arm.delay(self.lag_ms() / 1000, since_s - TOLD_S)
+        late = self._context.cell.arm.delay(max(self.lags_s, default=0.0), since_s - TOLD_S)
         began_ns = time.time_ns() - round(1e9 * (now_s - since_s))
         told = any(event.code in set(Delay) and event.wall_ns > began_ns for event in store.status.events)
         if late is not None and now_s - since_s > TOLD_S - CURRENT_S and not told:

@@ -50,7 +50,6 @@ def cut(how: str, ports: list[str] | None) -> dict[str, Any]:
 
 FAULTS: dict[str, tuple[Any, str]] = {
     "program stopped": ({"cmd": "stop_program"}, "program-ended"),
-    "program paused": ({"cmd": "pause"}, "program-ended"),
     "power off": ({"cmd": "power_off"}, "not-powered"),
     "remote control lost": ({"cmd": "remote", "on": False}, "local-control"),
     "TCP": ({"cmd": "tcp", "pose": [0.0, 0.0, 0.002, 0.0, 0.0, 0.0]}, "tcp-changed"),
@@ -140,7 +139,7 @@ async def test_another_clients_program_in_the_place_of_ours_is_named(
 
 async def test_a_program_paused_on_the_pendant_does_not_go_on_when_play_is_pressed(cell: MakeCell) -> None:
     c = await cell()
-    await c.strike({"cmd": "pause"})
+    assert (await c.strike({"cmd": "pause"})).code == "program-ended"
     await c.until(lambda state: state["runtime_state"] == "STOPPED")
     await c.ask("play")
     await c.stays_at_rest()

@@ -22,16 +22,6 @@ from station.simulation.cells import make_cell, seen_from
 from station.simulation.renderer import Light, render, scaled
 
 
-def test_a_picture_too_bright_says_what_to_set_on_the_screen() -> None:
-    camera = make_cell("paper", 0, "low", "eye-in-hand").camera
-    view = seen_from(PAPER_BOARD, 0.5)
-    for light, words in ((1.0, ""), (4.0, "too bright")):
-        picture = render(camera, PAPER_BOARD, view, Light(illumination=light), np.random.default_rng(0))
-        status = sight(picture, PAPER_BOARD, None, False, (10_000.0, 0.0)).status
-        assert status.advice.startswith(words) and bool(status.advice) == bool(words)
-    assert sight(picture, PAPER_BOARD, None, False).status.advice == ""
-
-
 @pytest.mark.parametrize("factor", [1.0, 0.5])
 def test_the_distance_is_the_same_in_a_preview_of_half_the_size(factor: float) -> None:
     camera = make_cell("paper", 0, "low", "eye-in-hand").camera

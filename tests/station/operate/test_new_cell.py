@@ -196,4 +196,6 @@ def test_a_fault_of_the_picture_is_named(fault: str, causes: set[str]) -> None:
     elif fault == "out of focus":
         pixels = np.asarray(cv2.GaussianBlur(pixels, (0, 0), 6.0), dtype=np.uint8)
     board = {"squares counted": COUNTED, "another board lies there": OTHER}.get(fault, PICTURED.board)
-    assert sight(pixels, board, None, exposure=(10_000.0, 0.0)).status.cause in causes
+    status = sight(pixels, board, None, exposure=(10_000.0, 0.0)).status
+    assert status.cause in causes and (bool(status.advice) or exposure_us is None)
+    assert not sight(pixels, board, None).status.advice, "an image of unknown exposure"

@@ -12,7 +12,6 @@ import pytest
 from station.analysis.estimation import running_estimate
 from station.analysis.pool import WorkerError, Workers
 from station.analysis.worker import start_worker, warm_up
-from station.cell.errors import RobotError
 from station.cell.pose_plan import PlannedPose
 from station.cell.session_folder import SessionState
 from station.cell.status import StationState as S
@@ -64,20 +63,6 @@ async def test_what_ends_freedrive_waits_for_its_image_unless_it_is_stop(
         await guided.session.switch_free_drive(1, True)
         await guided.session.record(1)
         assert guided.state is S.FREE_DRIVE and guided.arm.guided, "what was asked before is done"
-
-
-async def test_control_has_ended_before_the_recording_is_sealed(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seal = SessionRecording.seal
-
-    async def noted(self: SessionRecording, queue: Any) -> Any:
-        rig.arm.log.append("seal")
-        return await seal(self, queue)
-
-    monkeypatch.setattr(SessionRecording, "seal", noted)
-    await rig.go_until(S.IDLE)
-    assert rig.arm.log.index("end control") < rig.arm.log.index("seal")
 
 
 async def test_a_disk_that_fails_after_stop_is_told_and_stop_stays_latched(
@@ -188,15 +173,6 @@ async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
         await finishing
     assert held_seal.begun == 1 and rig.session.store.status.session.recording
     assert rig.arm.log.count("move") == moves
-
-
-async def test_a_fault_between_moves_stops_the_arm_by_both_ways(rig: Rig, held_disk: HeldDisk) -> None:
-    await rig.go_until(S.WRITING)
-    rig.arm.trouble = RobotError()
-    held_disk.set()
-    await rig.until(S.FAULT)
-    await until(lambda: "end control" in rig.arm.log)
-    assert "stop" in rig.arm.log
 
 
 async def test_a_defect_in_the_estimate_costs_one_estimate(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

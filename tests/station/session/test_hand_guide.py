@@ -175,17 +175,3 @@ async def test_freedrive_that_ends_while_news_are_late_is_no_fault(guided: Rig) 
     assert asked.exception() is not None
     assert rig.state is S.PAUSED and captured(rig) == 1
     await until(lambda: rig.session.store.status.guidance == GuidanceStatus())
-
-
-async def test_stop_in_a_view_that_is_taken_by_itself_is_latched(
-    guided: Rig, held_camera: asyncio.Event
-) -> None:
-    rig = guided
-    await rig.until(S.CAPTURING)
-    await rig.session.stop("bert")
-    assert rig.state is S.STOPPED
-    held_camera.set()
-    await until(lambda: not rig.session.freedrive.taking)
-    for _ in range(20):
-        await asyncio.sleep(0.02)
-        assert rig.state is S.STOPPED

@@ -11,6 +11,7 @@ from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import Image, RobotIdentity, RobotState, Stamps, Vector6
 from station.cell.errors import RobotError
 from station.cell.status import StationState as S
+from tests.patience import until
 from tests.station.session_rig import POSES, Rig, sealed
 
 TOOL: Vector6 = (0.01, -0.02, 0.15, 0.0, 0.3, 0.5)
@@ -97,4 +98,5 @@ async def test_what_speaks_against_the_pose_during_the_picture_counts(
     monkeypatch.setattr(rig.camera, "capture", meanwhile)
     await rig.go_until(S.FAULT)
     assert rig.session.store.status.cause == "tcp-changed"
-    assert rig.pose_states == ["planned"] * POSES
+    await until(lambda: "end control" in rig.arm.log)
+    assert "stop" in rig.arm.log and rig.pose_states == ["planned"] * POSES

@@ -33,7 +33,10 @@ WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
 
 
 async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> None:
+    sealing: list[list[str]] = []
+    rig.session.store.watch(lambda: sealing.append([*rig.arm.log]) if rig.state is S.SEALING else None)
     await rig.go_until(S.IDLE)
+    assert sealing and "end control" in sealing[0], "heartbeats end with the run"
     assert rig.states == [S.IDLE, S.CHECKING, *WHOLE_POSE * POSES, S.SEALING, S.IDLE]
     assert rig.pose_states == ["done"] * POSES
     assert rig.arm.log[: POSES + 2] == ["start control", *["move"] * POSES, "end control"]

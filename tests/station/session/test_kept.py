@@ -1,4 +1,4 @@
-"""What a session keeps: what a restart finds again, what the recording tells, what a person was told."""
+"""What a session keeps: for a restart, in the recording, and on the screen until the next begins."""
 
 from __future__ import annotations
 
@@ -72,3 +72,31 @@ async def test_a_picture_counts_until_its_pose_was_taken_again_by_an_arm_that_st
     await (rig.go_until(S.IDLE, purpose=Purpose.RESUME) if again else rig.session.finish(1))
     assert rig.arm.log.count("move") == (POSES if again else 1)
     assert [view.attempt for view in sealed(rig).views()] == ([2] + [1] * (POSES - 1) if again else [1])
+
+
+async def test_the_sealed_session_stays_shown_until_the_go(rig: Rig) -> None:
+    await rig.go_until(S.IDLE)
+    before = rig.session.store.status.session
+    summary = await rig.session.prepare(1, Purpose.RUN)
+    assert summary.poses == POSES
+    assert rig.session.store.status.session == before  # the answer may be no
+    rig.arm.slow = True
+    await rig.session.go(1, summary.token)
+    begun = rig.session.store.status.session
+    assert (begun.captured, begun.elapsed_s, begun.recording) == (0, 0.0, "")
+    assert set(rig.pose_states) == {"planned"}
+
+
+async def test_pictures_by_hand_after_a_sealed_session_are_a_session_of_their_own(rig: Rig) -> None:
+    await rig.go_until(S.IDLE)
+    for pictures in (1, 2):
+        await rig.session.switch_free_drive(1, True)
+        begun = rig.session.store.status.session
+        assert (begun.captured, begun.elapsed_s, begun.recording) == (0, 0.0, "")
+        assert set(rig.pose_states) == {"planned"} and len(rig.pose_states) == POSES
+        for _ in range(pictures):
+            await rig.session.record(1)
+        assert rig.session.store.status.session.captured == pictures
+        await rig.session.switch_free_drive(1, False)
+        await rig.session.finish(1)
+        assert len(list(sealed(rig).views())) == pictures

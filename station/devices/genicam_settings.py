@@ -30,7 +30,7 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
     camera.clear_triggers()
     # Cameras keep what the last program set: automatic functions, or an exposure as long as the pulse.
     for name, value in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("ExposureMode", "Timed")):
-        if camera.is_feature_available(name):
+        if camera.is_feature_available(name) and camera.get_string(name) != value:
             camera.set_string(name, value)
     camera.set_pixel_format_from_string(config.pixel_format)
     region: Region = config.region or (0, 0, *camera.get_sensor_size())

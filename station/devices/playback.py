@@ -104,9 +104,9 @@ class PlaybackRobot:
         poses, with_joints = len(self.views), sum(len(v.joints_rad or ()) == 6 for v in self.views)
         if not poses or with_joints < poses:
             raise RobotError("no-joints", path=recording, poses=poses, with_joints=with_joints)
-        self._from = self._to = self.views[0]
-        self._arrives_s = 0.0
-        """When the newest move ends (host monotonic)."""
+        self._view = self._before = self.views[0]
+        """Where it stands, and where it stood before `_since_ns` (host monotonic)."""
+        self._since_ns = 0
         self._callbacks: list[Callable[[RobotState], None]] = []
         self._publishing: asyncio.Task[None] | None = None
         self.control = False
@@ -124,11 +124,9 @@ class PlaybackRobot:
         return Plan(self.identity.model, self._recording.info.mount, poses, note="playback")
 
     def picture(self) -> Image:
-        """Return the image of the view at which the arm stands. CameraError during a move, or undecodable."""
-        if time.monotonic() < self._arrives_s:
-            raise CameraError("not-recorded")
+        """Return the image of the view at which the arm stands. CameraError: undecodable."""
         try:
-            return self._recording.image(self._to)
+            return self._recording.image(self._view)
         except RecordingError as error:
             raise CameraError.from_data(error.data) from error
 
@@ -147,9 +145,7 @@ class PlaybackRobot:
         age_s = (time.monotonic_ns() - host_monotonic_ns) / 1e9
         if not -0.01 <= age_s <= 10.0:
             raise StaleStateError("no-history")
-        left_s = self._arrives_s - host_monotonic_ns / 1e9
-        view = self._from if left_s > 0 else self._to
-        way = np.subtract(_joints(self._to), _joints(self._from)) * (0 < left_s <= MOVE_S)
+        view = self._view if host_monotonic_ns >= self._since_ns else self._before
         tcp = self.identity.tcp_offset
         tool = np.array(view.base_from_flange) @ pose_from_rotvec(tcp[:3], tcp[3:])
         return RobotState(
@@ -159,8 +155,8 @@ class PlaybackRobot:
                 controller_s=host_monotonic_ns / 1e9,
             ),
             joints_rad=_joints(view),
-            joint_speeds_rad_s=vector6(way / MOVE_S),
-            target_joints_rad=_joints(self._to),
+            joint_speeds_rad_s=(0.0,) * 6,
+            target_joints_rad=_joints(view),
             tcp_pose=pose_vector(tool),
             robot_mode=7,
             safety_mode=1,
@@ -198,9 +194,10 @@ class PlaybackRobot:
             raise RobotError("control-not-started", why="")
         if off[nearest] > _SAME_JOINTS_RAD:
             raise RobotError("not-recorded")
-        self._from, self._to = self._to, self.views[nearest]
-        self._arrives_s = time.monotonic() + MOVE_S
         await asyncio.sleep(MOVE_S)
+        if self.control:
+            self._before, self._view = self._view, self.views[nearest]
+            self._since_ns = time.monotonic_ns()
 
     def heartbeat(self) -> None: ...
 
@@ -212,8 +209,6 @@ class PlaybackRobot:
         raise RobotError("playback")
 
     async def stop(self, reason: str) -> None:
-        if time.monotonic() < self._arrives_s:
-            self._to, self._arrives_s = self._from, 0.0
         self.control = False
 
     async def end_control(self) -> None:

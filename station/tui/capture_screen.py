@@ -12,7 +12,6 @@ from station.cell.status import StationState
 from station.protocol import verbs
 from station.protocol.states import LATCHED, RUNNING
 from station.tui.capture_panels import coverage_lines, error_lines, quality_line
-from station.tui.daemon_link import DaemonApp
 from station.tui.frame import Line
 from station.tui.progress import LEGEND, progress_lines
 from station.tui.screen import Box, Panel, StationScreen
@@ -45,19 +44,13 @@ class CaptureScreen(StationScreen):
 
     def action_take_back(self) -> None:
         """Take back the last view that counts; only by hand."""
-        assert isinstance(self.app, DaemonApp)
-        status = self.app.known.shown
+        status = self.known.shown
         counting = [pose.index for pose in status.session.poses if pose.counts]
         if status.state is StationState.FREE_DRIVE and counting:
             self.ask(verbs.Skip(counting[-1]))
 
     def show(self, known: Known) -> None:
-        super().show(known)
-        self.query_one(Stopped).show(known)
-        status = known.status
-        if status is None:
-            return
-        session = status.session
+        status, session = known.shown, known.shown.session
         by_hand = bool(status.guidance.outline)
         progress = self.query_one("#progress", Panel)
         progress.border_subtitle = BACK if by_hand else LEGEND
@@ -68,11 +61,11 @@ class CaptureScreen(StationScreen):
         error = self.query_one("#error", Panel)
         error.heading = "Drift check" if session.check else "Predicted error"
         error.border_subtitle = "" if session.check else ERROR_LEGEND
-        self.draw_panels(known)
         self.query_one("#picture").border_title = (
             f"Camera  {status.camera.model}"
             if status.camera.connected or status.playback
             else "Camera: not connected"
         )
-        self.query_one("#quality", Line).show(known)
         self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")
+        self.query_one(Stopped).show(known)
+        super().show(known)

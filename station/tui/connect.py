@@ -11,7 +11,6 @@ from textual.content import Content
 from station.protocol.verbs import Check
 from station.tui.frame import Line
 from station.tui.screen import Box, StationScreen
-from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import Mark, dim, hanging, lines, mark
 
@@ -65,10 +64,6 @@ class ConnectScreen(StationScreen):
                 yield Line(lambda known, width: checklist_text(known.checks, width), id="checklist")
             with Box("Camera", id="connect-picture", below="o: in a browser"):
                 yield PreviewPane(id="preview")
-
-    def show(self, known: Known) -> None:
-        super().show(known)
-        self.query_one("#checklist", Line).show(known)
 
     async def look_again(self) -> None:
         """Check again while something is missing, whatever is shown; an arm at work is left in peace."""

@@ -79,10 +79,6 @@ class ConfirmMotion(Confirm):
         self.set_interval(1.0, self._count_down)
         self._count_down()
 
-    def show(self, known: Known) -> None:
-        super().show(known)
-        self.query_one(Panel).show(known)
-
     def _count_down(self) -> None:
         left_s = max(0.0, self._until_s - time.monotonic())
         line = Content.assemble(

@@ -62,11 +62,9 @@ class StopBlock(Static):
 class Line(Static):
     """Text that is drawn again only when it changed, or the width did."""
 
-    def __init__(
-        self, line: Callable[[Known, int], Content], *, id: str, layout: bool = False, classes: str = ""
-    ) -> None:
+    def __init__(self, line: Callable[[Known, int], Content], *, id: str, classes: str = "") -> None:
         super().__init__(id=id, classes=classes)
-        self._line, self._layout = line, layout
+        self._line = line
         self._known: Known | None = None
         self._shown = Content()
 
@@ -76,17 +74,10 @@ class Line(Static):
 
     def show(self, known: Known) -> None:
         self._known = known
-        text = self._line(known, self.container_size.width if self._layout else self.size.width)
+        text = self._line(known, self.size.width)
         if not text.is_same(self._shown):
-            layout = self._layout or self._grows(text)
-            self._shown = text
-            self.update(text, layout=layout)
-
-    def _grows(self, text: Content) -> bool:
-        """Tell whether the height follows the text and this text has another number of lines."""
-        height = self.styles.height
-        lines, shown = (each.plain.count("\n") for each in (text, self._shown))
-        return lines != shown and height is not None and height.is_auto
+            self._shown, height = text, self.styles.height
+            self.update(text, layout=height is not None and height.is_auto)
 
 
 class Frame(Horizontal):
@@ -100,18 +91,11 @@ class Frame(Horizontal):
         with Vertical(classes="head"):
             yield Line(lambda known, width: bar_line(known, self._title, width), id="bar")
             yield Line(lambda known, width: rail_line(steps(known), self._mode, width), id="rail")
-            yield Line(self._next, id="next", layout=True)
+            yield Line(self._next, id="next")
         yield StopBlock(id="stop")
 
     def _next(self, known: Known, width: int) -> Content:
         return next_line(self.question or next_action(known).on(self._mode), width)
-
-    def show(self, known: Known) -> None:
-        for line in self.query(Line):
-            line.show(known)
-        live = known.live
-        latched, by_hand = live is not None and live.state in LATCHED, live is not None and live.robot.by_hand
-        self.query_one(StopBlock).show(latched, by_hand)
 
 
 def bar_line(known: Known, title: str, width: int) -> Content:
@@ -273,8 +257,14 @@ class Framed(Screen[R]):
 
     def show(self, known: Known) -> None:
         """Draw every part from what is known."""
-        for frame in self.query(Frame):
-            frame.show(known)
+        for line in self.query(Line):
+            line.show(known)
+        live = known.live
+        for block in self.query(StopBlock):
+            block.show(
+                latched=live is not None and live.state in LATCHED,
+                by_hand=live is not None and live.robot.by_hand,
+            )
 
     async def on_screen_resume(self) -> None:
         self.watch(self.app, "known", self._hear)

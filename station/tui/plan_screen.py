@@ -79,11 +79,7 @@ class PlanScreen(StationScreen):
 
     def show(self, known: Known) -> None:
         super().show(known)
-        if (status := known.status) is None:
-            return
-        self.query_one("#plan-facts", Line).show(known)
-        self.table.show([row_of(pose) for pose in status.session.poses])
-        self.draw_panels(known)
+        self.table.show([row_of(pose) for pose in known.shown.session.poses])
 
     def _cell(self, known: Known, width: int, height: int) -> Content:
         chosen = self.table.cursor_row if known.shown.session.poses else None

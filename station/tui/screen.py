@@ -130,8 +130,4 @@ class StationScreen(Framed[None]):
         return self.query_one(Rows)
 
     def on_data_table_row_highlighted(self) -> None:
-        self.draw_panels(self.known)
-
-    def draw_panels(self, known: Known) -> None:
-        for panel in self.query(Panel):
-            panel.show(known)
+        self.show(self.known)

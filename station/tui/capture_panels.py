@@ -62,7 +62,7 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
 def error_lines(known: Known, width: int, height: int) -> Content:
     """Write the predicted error and the goal; draw the error after each pose. A drift check has neither."""
     if known.shown.session.check:
-        return dim("A drift check: when all images are taken, they judge the installed calibration.")
+        return dim("When all images are taken, they\njudge the installed calibration.")
     estimate, poses, goal = known.shown.estimate, known.shown.session.poses, known.goal_mm
     head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:

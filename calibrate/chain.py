@@ -244,8 +244,7 @@ def wrong_row(learned: LearnedChain, joints_rad: Array, flanges: Array) -> int |
 def _fit_rotations(joints_rad: Array, R: Array, at: int) -> tuple[Array, float]:
     """Fit the axes at the posture of view `at`, and the flange's turn from there: (n + 1, 3), and the rms.
 
-    Linear start: small turns of the joints add up as vectors, so views count by how near they are. Axes of
-    free length first, then of unit length.
+    Linear start: small turns of the joints add up as vectors, so views count by how near they are.
     """
     from scipy import optimize  # programs that only move along a chain need not wait for it
 
@@ -255,11 +254,10 @@ def _fit_rotations(joints_rad: Array, R: Array, at: int) -> tuple[Array, float]:
     near = others[: joints_rad.shape[1] + 1].max(initial=1e-12)
     weight = np.exp(-square / near)[:, None]
     start = np.linalg.lstsq(weight * away, weight * rotation_log(turned), rcond=None)[0]
+    start[~start.any(axis=1)] = [0.0, 0.0, 1.0]  # a joint that rests may turn about anything
     x = np.append(start, np.zeros(3))
-    for unit in (False, True):
-        fit = optimize.least_squares(_turn_misses, x, _turn_jacobian, args=(away, turned, unit), **_PRECISE)
-        x = fit.x
-    found = x.reshape(-1, 3)
+    fit = optimize.least_squares(_turn_misses, x, _turn_jacobian, args=(away, turned), **_PRECISE)
+    found = fit.x.reshape(-1, 3)
     found[:-1] /= np.linalg.norm(found[:-1], axis=1, keepdims=True)
     return found, float(np.sqrt(2 * fit.cost / len(R)))
 
@@ -276,29 +274,26 @@ def _products(axes: Array, away: Array) -> Array:
     return np.stack(products, axis=1)
 
 
-def _turn_misses(x: Array, away: Array, turned: Array, unit: bool) -> Array:
+def _turn_misses(x: Array, away: Array, turned: Array) -> Array:
     """Compute Log(modelled · measuredᵀ) (3m,) for x = [axes, lead]."""
-    axes, lead, _ = _axes_of(x, unit)
+    axes, lead, _ = _axes_of(x)
     modelled = _products(axes, away)[:, -1] @ rotation_exp(lead)
     return np.asarray(rotation_log(modelled @ np.swapaxes(turned, 1, 2)).ravel())
 
 
-def _turn_jacobian(x: Array, away: Array, turned: Array, unit: bool) -> Array:
-    axes, lead, by_x = _axes_of(x, unit)
+def _turn_jacobian(x: Array, away: Array, turned: Array) -> Array:
+    axes, lead, by_x = _axes_of(x)
     products = _products(axes, away)
-    miss = _turn_misses(x, away, turned, unit).reshape(-1, 3)
+    miss = _turn_misses(x, away, turned).reshape(-1, 3)
     by_axis = products[:, :-1] @ left_jacobian(axes * away[..., None]) * away[..., None, None] @ by_x
     by_lead = products[:, -1:] @ left_jacobian(lead)
     J = np.concatenate([by_axis, by_lead], axis=1).transpose(0, 2, 1, 3).reshape(len(away), 3, -1)
     return np.asarray((inverse_left_jacobian(miss) @ J).reshape(miss.size, -1))
 
 
-def _axes_of(x: Array, unit: bool) -> tuple[Array, Array, Array]:
-    """Split x into axes (n, 3) and lead (3,), with the derivative (n, 3, 3) of the axes."""
+def _axes_of(x: Array) -> tuple[Array, Array, Array]:
+    """Split x into unit axes (n, 3) and lead (3,), with the derivative (n, 3, 3) of the axes by x."""
     found = x.reshape(-1, 3)
-    axes, by_x = found[:-1], np.broadcast_to(np.eye(3), (len(found) - 1, 3, 3))
-    if unit:
-        length = np.linalg.norm(axes, axis=1)[:, None]
-        axes = axes / length
-        by_x = (by_x - axes[:, :, None] * axes[:, None]) / length[:, None]
-    return axes, found[-1], by_x
+    length = np.linalg.norm(found[:-1], axis=1)[:, None]
+    axes = found[:-1] / length
+    return axes, found[-1], (np.eye(3) - axes[:, :, None] * axes[:, None]) / length[:, None]

@@ -55,12 +55,6 @@ def arm_results(
     )
 
 
-def _helps(missed_m: Array) -> bool:
-    """Tell whether the corrected arm misses less than the arm as it is; (2, n), NaN: unknown."""
-    as_it_is, corrected = np.nanmean(missed_m**2, axis=1)
-    return bool(corrected < as_it_is)
-
-
 def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | None) -> ArmRefusal | None:
     if not detected:
         return "no-evidence"
@@ -69,6 +63,7 @@ def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | Non
     off = difference(arm.chain.forward(arm.joints_rad), fit.views.base_from_flange)[:, :3]
     if np.sqrt(np.mean((off**2).sum(axis=1))) > max(_NOMINAL_M, 3 * float(fit.estimate.scales.robot[0])):
         return "not-nominal"
-    if missed is not None and not _helps(missed):
-        return "not-better"
+    if missed is not None:
+        as_it_is, corrected = np.nanmean(missed**2, axis=1)
+        return None if corrected < as_it_is else "not-better"
     return None

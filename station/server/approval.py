@@ -25,7 +25,7 @@ class Process:
     terminal: str
     """Terminal in whose foreground it is, such as 'pts/3'; empty: none."""
     parent: int = 0
-    """Process that started it; a screen's hears F12 for it (`tui.stop_key`)."""
+    """Process that started it; that of a screen is in the person's terminal (`tui.stop_key`)."""
 
 
 def process(pid: int) -> Process | None:
@@ -64,9 +64,7 @@ class Peer:
     terminal: str = ""
     """Terminal at which its person was seen when it first asked; empty: none."""
     began_ticks: int | None = None
-    """Start of the process that made the connection; None: not known."""
-    parent: int = 0
-    """The process that started it; 0: not known."""
+    """Start of the process that made the connection; None: not looked up yet; -1: it could not be seen."""
 
     @property
     def who(self) -> str:
@@ -82,6 +80,13 @@ class ApprovalRule:
         self, config: ApprovalConfig, simulated: bool, see: Callable[[int], Process | None] = process
     ) -> None:
         self._config, self._simulated, self._see = config, simulated, see
+
+    def meet(self, peer: Peer) -> None:
+        """Note, when a client first asks, when its process began and where its person sees it."""
+        if peer.began_ticks is None:
+            seen = self._see(peer.pid)
+            peer.began_ticks = -1 if seen is None else seen.began_ticks
+            peer.terminal = self.terminal(peer)
 
     def by_person(self, asks: Peer, what: str) -> str:
         """Check that a person may approve from this client; return how, for the log. Else RefusedError."""

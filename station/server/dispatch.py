@@ -21,10 +21,9 @@ class SessionDispatcher:
     """The session as the connections of `server.connections` reach it."""
 
     def __init__(self, session: Session, see: Callable[[int], Process | None] = process) -> None:
-        self._session, self._see = session, see
+        self._session = session
         cell = session.context.cell
         self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
-        self._callers: dict[int, Peer] = {}
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
         """User id → name, once looked up."""
@@ -34,15 +33,11 @@ class SessionDispatcher:
         return self._to_the_end(self._session.stop(peer.who))
 
     def stop_by_datagram(self, sender: Peer) -> None:
-        """Begin STOP for a sender without a connection, named by that of its process or of a child of it."""
-        callers = (caller for caller in self._callers.values() if caller.uid == sender.uid)
-        known = (caller for caller in callers if sender.pid in (caller.pid, caller.parent))
-        caller = next(known, None)
-        user = self._names.get(sender.uid, f"uid {sender.uid}")
-        who = caller.who if caller else f"{user} (pid {sender.pid})"
-        self._to_the_end(self._session.stop(who))
-        if sender.uid not in self._names:
-            self._to_the_end(self._name(sender.uid))
+        """Begin STOP for a sender without a connection."""
+        self._rule.meet(sender)
+        sender.user = self._names.get(sender.uid, "")
+        self._to_the_end(self._session.stop(sender.who))
+        self._to_the_end(self._name(sender.uid))
 
     async def _name(self, uid: int) -> str:
         if uid not in self._names:
@@ -52,7 +47,6 @@ class SessionDispatcher:
 
     def gone(self, peer: Peer) -> None:
         """Handle the end of a connection; the arm decelerates at once if it had control."""
-        self._callers.pop(peer.client_id, None)
         self._to_the_end(self._session.lease_lost(peer.client_id))
 
     def _to_the_end(self, work: Coroutine[object, object, object]) -> asyncio.Future[object]:
@@ -62,26 +56,17 @@ class SessionDispatcher:
         task.add_done_callback(self._leaving.discard)
         return asyncio.shield(task)
 
-    async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> object:
+    async def handle(self, caller: Peer, verb: str, args: msgspec.Raw) -> object:
         """Carry out a verb. RefusedError for wrong arguments, in a wrong state, or without control."""
         kind = VERBS[verb]
         try:
             request = msgspec.json.decode(args, type=kind)
         except msgspec.DecodeError as error:
             raise RefusedError("wrong-arguments", verb=verb, problem=str(error)) from None
-        caller = self._caller(peer)
+        self._rule.meet(caller)
         self._session.admit(kind, caller.client_id, caller.who)
         result = await self._carry_out(caller, request)
         return verbs.Done() if result is None else result
-
-    def _caller(self, peer: Peer) -> Peer:
-        if peer.client_id not in self._callers:
-            self._callers[peer.client_id] = peer
-            seen = self._see(peer.pid)
-            if seen is not None:
-                peer.began_ticks, peer.parent = seen.began_ticks, seen.parent
-                peer.terminal = self._rule.terminal(peer)
-        return peer
 
     async def _carry_out(self, caller: Peer, verb: Verb[object]) -> object:
         """Call what a verb is of; None: it has no result. `_to_the_end`: also if the client disconnects."""

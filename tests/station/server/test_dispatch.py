@@ -290,12 +290,6 @@ def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
     assert done.stdout.strip() == "''"
 
 
-async def test_who_is_turned_away_is_not_kept(served: Served) -> None:
-    dispatcher = SessionDispatcher(served.rig.session)
-    await dispatcher.stop_by_client(Peer(client_id=99, pid=1, uid=0))
-    assert not dispatcher._callers and "uid 0 (pid 1)" in served.rig.session.store.status.reason
-
-
 async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna:
         await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
@@ -309,11 +303,14 @@ async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
             await bert.request("go", token=summary["token"])
 
 
-async def test_stop_by_the_process_that_hears_a_screens_key_is_named_by_the_screen(served: Served) -> None:
-    async with await served.client():
-        served.dispatcher.stop_by_datagram(Peer(0, os.getppid(), os.getuid()))
-        await until(lambda: served.rig.session.store.state is StationState.STOPPED)
-    assert f"(pid {os.getpid()})" in served.rig.session.store.status.reason
+async def test_stop_without_a_connection_is_named_by_the_persons_terminal(served: Served) -> None:
+    dispatcher = SessionDispatcher(served.rig.session, at_a_terminal)
+    await dispatcher.stop_by_client(Peer(0, 5, os.getuid()))
+    assert f"uid {os.getuid()} (pid 5)" in served.rig.session.store.status.reason  # it asked nothing before
+    await served.rig.session.acknowledge("anna")
+    dispatcher.stop_by_datagram(Peer(0, 5, os.getuid()))
+    await until(lambda: served.rig.session.store.state is StationState.STOPPED)
+    assert f"uid {os.getuid()} on pts/3 (pid 5)" in served.rig.session.store.status.reason
 
 
 def test_an_approval_in_a_screen_is_told_by_the_persons_own_terminal() -> None:

@@ -9,7 +9,6 @@ import logging
 import os
 import sys
 from dataclasses import replace
-from functools import partial
 from multiprocessing import util
 from pathlib import Path
 from typing import Annotated
@@ -83,7 +82,7 @@ def serve_command(
         truth = make_cell(scene, seed, noise, mount)
         cell = simulated_cell(
             truth,
-            partial(cell_config, truth),
+            cell_config(truth),
             place / "simulation",
             time_scale=time_scale,
             gige=gige,

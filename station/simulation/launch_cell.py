@@ -7,9 +7,7 @@ initial poses, and no address in the configuration is ever used.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -33,7 +31,7 @@ TRUTH = "truth.json"
 
 def simulated_cell(
     truth: CellTruth,
-    configured: Callable[[str], StationConfig],
+    config: StationConfig,
     folder: Path,
     *,
     time_scale: float = 1.0,
@@ -43,8 +41,8 @@ def simulated_cell(
 ) -> Cell:
     """Make a cell that is as `truth` says and start its controller; blocking (a second). Raises StationError.
 
-    `configured`: its configuration for a controller's address; `path`: the file that it comes from. `folder`
-    takes truth and logs. `time_scale`: speed of simulated time; above 1 in tests only. `gige`: simulate the
+    `config`: its configuration, but for the controller's address; `path`: its file. `folder` takes truth and
+    logs. `time_scale`: speed of simulated time; above 1 in tests only. `gige`: simulate the
     camera over GigE Vision, in a network namespace with only `lo`. `attachments`: of every recording, besides
     the truth.
     """
@@ -54,7 +52,8 @@ def simulated_cell(
     with ExitStack() as ends:
         controller = start_controller(truth.robot_model, truth=file, time_scale=time_scale, log=log)
         camera: Camera
-        config = configured(ends.enter_context(controller).host)
+        robot = msgspec.structs.replace(config.robot, host=ends.enter_context(controller).host)
+        config = msgspec.structs.replace(config, robot=robot)
         if gige:
             # The simulator has no test packets to negotiate a packet size with; loopback carries the largest.
             changes = {"driver": "aravis", "device": "127.0.0.1", "packet_size": GIGE_PACKET_BYTES}
@@ -64,11 +63,11 @@ def simulated_cell(
         else:
             camera = RenderedCamera(truth, config.robot.host, config.camera)
         started = ends.pop_all()
-    robot = UrRobot(config.robot, folder)
+    arm = UrRobot(config.robot, folder)
     return Cell(
         config=config,
-        arm=robot,
-        mover=robot,
+        arm=arm,
+        mover=arm,
         camera=camera,
         source="simulated",
         config_path=path,
@@ -106,9 +105,9 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, control: Path
     socket. Raises ConfigError where planning lacks something, LimitError where the board cannot be looked at,
     StationError. A posted arm stays one: its program declares that its poses are simulated.
     """
-    truth = truth_within(config, seed)
+    truth, simulated = truth_within(config, seed), without_devices(config)
     if config.robot.driver == "posted":
-        return _posted_cell(without_devices(config, ""), path, folder, control, truth)
+        return _posted_cell(simulated, path, folder, control, truth)
     about = {
         "configuration": Path(path).name,
         "robot_sigma_mm": 1e3 * REPEATABILITY_M,
@@ -116,7 +115,7 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, control: Path
     }
     return simulated_cell(
         truth,
-        partial(without_devices, config),
+        simulated,
         folder,
         path=path,
         attachments={ATTACHMENT: json.dumps(about).encode()},
@@ -137,12 +136,12 @@ def _posted_cell(config: StationConfig, path: str, folder: Path, control: Path, 
     return Cell(config, arm, camera, "simulated", config_path=path, attachments=attachments)
 
 
-def without_devices(config: StationConfig, host: str) -> StationConfig:
-    """Replace the devices of a configuration by the simulated controller at `host` and camera.
+def without_devices(config: StationConfig) -> StationConfig:
+    """Remove the devices from a configuration: addresses, serial number, trigger box; the camera is rendered.
 
     Limits, board, initial poses, approval and goals stay. Factory corrections of the real arm are removed.
     """
-    robot = msgspec.structs.replace(config.robot, host=host, serial="", kinematics=None)
+    robot = msgspec.structs.replace(config.robot, host="", serial="", kinematics=None)
     camera = msgspec.structs.replace(
         config.camera, driver="rendered", device="", trigger="software", region=None
     )

@@ -96,6 +96,7 @@ def _simulated() -> tuple[StationConfig, list[float]]:
     # Simulation is loaded only where it is wanted.
     from station.simulation.cells import cell_config, make_cell
 
+    err.print("This is a plan of the SIMULATED cell. Name yours: --config FILE.", style="yellow")
     truth = make_cell("paper", 0, "low", "eye-in-hand")
     return cell_config(truth), list(truth.start_joints_rad)
 

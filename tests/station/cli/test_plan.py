@@ -26,7 +26,7 @@ def made(tmp_path_factory):
 def test_a_plan_is_made_shown_and_saved(made):
     result, file = made
     assert result.returncode == 0, result.stderr
-    assert "12 poses" in result.stdout and "check: passed" in result.stdout
+    assert "12 poses" in result.stdout and "check: passed" in result.stdout and "SIMULATED" in result.stderr
     plan = load_plan(file)
     assert len(plan.poses) == 12
     rows = [line for line in result.stdout.splitlines() if line.startswith(tuple(p.name for p in plan.poses))]
@@ -60,7 +60,8 @@ def test_checking_needs_no_lens_but_knows_as_the_daemon_does_what_to_keep_clear_
     unplaced = msgspec.structs.replace(config, board_guess=None)
     for cell, code in ((blind, 0), (unplaced, 2)):
         (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(cell))
-        assert run("--config", tmp_path / "cell.yaml", "--check", made[1]).returncode == code
+        found = run("--config", tmp_path / "cell.yaml", "--check", made[1])
+        assert found.returncode == code and "SIMULATED" not in found.stderr
 
 
 def test_only_plans_are_written_over(tmp_path):

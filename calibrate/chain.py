@@ -28,7 +28,7 @@ from calibrate.geometry import (
     rotation_log,
     skew,
 )
-from calibrate.kinematics import RobotModel, link_frames
+from calibrate.kinematics import DhTable, link_frames
 from calibrate.results import LearnedArm
 
 
@@ -134,7 +134,7 @@ class Chain:
             yield at
 
 
-def chain_of(model: RobotModel) -> Chain:
+def chain_of(model: DhTable) -> Chain:
     """Describe a table by its axes with all joints at 0."""
     frames = link_frames(model, np.zeros(6))
     return Chain(frames[:6, :3, 2], frames[:6, :3, 3], np.zeros(6), frames[6])

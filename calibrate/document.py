@@ -19,7 +19,6 @@ from calibrate.files.calibration import (
     ArmErrorValue,
     Calibration,
     CorrectedArm,
-    DhTable,
     FramePose,
     HeldOutViews,
     Lens,
@@ -33,7 +32,7 @@ from calibrate.files.calibration import (
 )
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.solution import ArmResult, Solution
-from calibrate.kinematics import table_of_axes
+from calibrate.kinematics import DhTable, table_of_axes
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.projection import intrinsics_names

@@ -25,18 +25,33 @@ URDF_ORIGIN = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 COLUMNS = ("a_m", "d_m", "alpha_rad", "theta_rad", "beta_rad")
+Six = tuple[float, float, float, float, float, float]
 
 
 @dataclass(frozen=True)
-class RobotModel:
+class DhTable:
+    """A kinematic table, joint 1 first: frame i from i-1 is Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)."""
+
+    a_m: Six
+    d_m: Six
+    alpha_rad: Six
+    theta_rad: Six
+    beta_rad: Six
+
+    @classmethod
+    def of(cls, model: DhTable) -> DhTable:
+        """Take the table alone of an arm's model."""
+        return DhTable(*(getattr(model, name) for name in COLUMNS))
+
+
+@dataclass(frozen=True)
+class RobotModel(DhTable):
     """Kinematic table and limits of a UR arm."""
 
-    name: str
-    a_m: tuple[float, ...]
-    d_m: tuple[float, ...]
-    alpha_rad: tuple[float, ...] = _ALPHA
-    theta_rad: tuple[float, ...] = (0.0,) * 6
-    beta_rad: tuple[float, ...] = (0.0,) * 6
+    alpha_rad: Six = _ALPHA
+    theta_rad: Six = (0.0,) * 6
+    beta_rad: Six = (0.0,) * 6
+    name: str = ""
     joint_limit_rad: float = 2 * np.pi
     """Joints turn within ± this."""
     link_radius_m: tuple[float, ...] = field(default=(0.09, 0.075, 0.06, 0.05, 0.05, 0.045))
@@ -56,7 +71,7 @@ class RobotModel:
 
 
 def _model(name: str, a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> RobotModel:
-    return RobotModel(name, (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6))
+    return RobotModel((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), name=name)
 
 
 MODELS: dict[str, RobotModel] = {
@@ -73,7 +88,7 @@ MODELS: dict[str, RobotModel] = {
 }
 
 
-def link_frames(model: RobotModel, joints_rad: ArrayLike) -> Array:
+def link_frames(model: DhTable, joints_rad: ArrayLike) -> Array:
     """Compute base_from_link (..., 7, 4, 4) of joints (..., 6); link 0 is the base, 6 the flange."""
     q = np.asarray(joints_rad, dtype=float)
     frames = np.zeros((*q.shape[:-1], 7, 4, 4))

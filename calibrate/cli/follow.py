@@ -12,7 +12,8 @@ import msgspec
 import typer
 
 from calibrate.cli.installed import CameraName, Root
-from calibrate.files.calibration import SOURCE_STAMPS, FramePose, Lens
+from calibrate.files.calibration import FramePose, Lens
+from calibrate.files.formatting import SOURCE_STAMPS
 from calibrate.files.loader import InstallationChange, watch
 from calibrate.files.validity import Validity, validity_text
 from recordings.files import MAIN_CAMERA

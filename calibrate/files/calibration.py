@@ -20,7 +20,7 @@ from calibrate.errors import CalibrationFileError
 from calibrate.files.integrity import check_result, content_sha256, read_bounded, verified_plain
 from calibrate.files.touch import Touch
 from calibrate.geometry import Array, Transform
-from calibrate.kinematics import RobotModel
+from calibrate.kinematics import DhTable
 from calibrate.results import (
     BoardShape,
     Certificate,
@@ -42,17 +42,8 @@ from recordings.schema.messages import (
     Mount,
     RobotIdentity,
     Source,
-    Vector6,
     WallTime,
 )
-
-SOURCE_STAMPS: dict[Source, str] = {
-    "real": "",
-    "simulated": "SIMULATED: made without a robot or a camera",
-    "playback": "PLAYBACK: the images were played back",
-    "imported": "IMPORTED: images and poses of unknown origin",
-}
-"""Warning to show with a calibration of no real cell."""
 
 FORMAT: Literal["handeye-calibration/2"] = "handeye-calibration/2"
 Vector3 = tuple[float, float, float]
@@ -159,20 +150,6 @@ class Arm(msgspec.Struct, frozen=True):
     """1σ of the links' turns; 0 in older files, whose `size_mm` is both."""
 
 
-class DhTable(msgspec.Struct, frozen=True):
-    """A kinematic table, joint 1 first: frame i from i-1 is Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)."""
-
-    a_m: Vector6
-    d_m: Vector6
-    alpha_rad: Vector6
-    theta_rad: Vector6
-    beta_rad: Vector6
-
-    @classmethod
-    def of(cls, model: RobotModel) -> DhTable:
-        return msgspec.convert(model, cls, from_attributes=True)
-
-
 class HeldOutViews(msgspec.Struct, frozen=True):
     """Rms error of the board's middle in views predicted from views taken elsewhere."""
 
@@ -268,7 +245,8 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
 def _chain(table: DhTable | None, chain: LearnedArm | None) -> Chain:
     if chain is not None:
         return Chain.of(chain)
-    return chain_of(RobotModel("", **msgspec.structs.asdict(table)))  # type: ignore[arg-type]
+    assert table is not None  # one of them: `__post_init__`
+    return chain_of(table)
 
 
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -11,11 +11,20 @@ from rich.table import Table
 from rich.text import Text
 
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import SOURCE_STAMPS, Calibration, Override
+from calibrate.files.calibration import Calibration, Override
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.geometry import roll_pitch_yaw
 from calibrate.results import BoardShape
+from recordings.schema.messages import Source
+
+SOURCE_STAMPS: dict[Source, str] = {
+    "real": "",
+    "simulated": "SIMULATED: made without a robot or a camera",
+    "playback": "PLAYBACK: the images were played back",
+    "imported": "IMPORTED: images and poses of unknown origin",
+}
+"""Warning to show with a calibration of no real cell."""
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ import numpy as np
 from calibrate.annotate import placed_corners
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import board_points, describe_board
-from calibrate.files.calibration import SOURCE_STAMPS
 from calibrate.files.formatting import (
+    SOURCE_STAMPS,
     arm_sentences,
     cell_sentences,
     error_shares,

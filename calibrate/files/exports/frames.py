@@ -10,7 +10,8 @@ import numpy as np
 import yaml
 
 from calibrate.errors import UsageError
-from calibrate.files.calibration import SOURCE_STAMPS, Calibration
+from calibrate.files.calibration import Calibration
+from calibrate.files.formatting import SOURCE_STAMPS
 from calibrate.files.validity import Validity, validity_text
 from calibrate.geometry import Array, inverse, pose
 from calibrate.kinematics import MODELS

@@ -11,11 +11,11 @@ import yaml
 from numpy.typing import ArrayLike
 
 from calibrate.errors import UsageError
-from calibrate.files.calibration import Calibration, CorrectedArm, DhTable
+from calibrate.files.calibration import Calibration, CorrectedArm
 from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment, how_to_attach
 from calibrate.files.integrity import content_sha256
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
-from calibrate.kinematics import URDF_LINKS, URDF_ORIGIN, RobotModel, link_frames
+from calibrate.kinematics import URDF_LINKS, URDF_ORIGIN, DhTable, link_frames
 
 
 def urdf(calibration: Calibration, frames: FrameNames) -> str:
@@ -73,12 +73,11 @@ def link_origins(table: DhTable) -> Array:
 
     Raises UsageError where the table has a transform after the last joint, which that chain cannot hold.
     """
-    a, d, alpha, theta, beta = (getattr(table, name) for name in table.__struct_fields__)
-    model, after = RobotModel("corrected", a, d, alpha, theta, beta), [a[5], alpha[5], beta[5]]
-    if np.abs(after).max() > 1e-12:
+    if np.abs([table.a_m[5], table.alpha_rad[5], table.beta_rad[5]]).max() > 1e-12:
         raise UsageError("table-behind-joint-6")
     axis = np.eye(3)[2]
-    links = link_frames(model, np.zeros(6))[:6] @ pose(rotation_exp(np.outer(theta, axis)), np.outer(d, axis))
+    turned = pose(rotation_exp(np.outer(table.theta_rad, axis)), np.outer(table.d_m, axis))
+    links = link_frames(table, np.zeros(6))[:6] @ turned
     return np.asarray(inverse(np.stack([np.eye(4), *links[:-1]])) @ links)
 
 

@@ -19,7 +19,6 @@ from calibrate.files import exports
 from calibrate.files.calibration import (
     Calibration,
     CorrectedArm,
-    DhTable,
     FramePose,
     decode_calibration,
     encode_calibration,
@@ -28,7 +27,7 @@ from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, rotation_exp
 from calibrate.job import SolvedRecording
-from calibrate.kinematics import MODELS, RobotModel, forward, table_of_axes, with_near_axes
+from calibrate.kinematics import MODELS, DhTable, RobotModel, forward, table_of_axes, with_near_axes
 from calibrate.recorded_views import arm_of_ros
 from recordings.schema.messages import RobotIdentity
 from tests.codes import raises

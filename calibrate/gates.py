@@ -1,7 +1,7 @@
 """Gates: named conditions that a calibration must meet before it may be installed.
 
-A gate is, under one name, a limit in `GateLimits`, a rule in `_RULES`, and a value that `_measured` yields of
-the solution; None: it is not judged. A new figure is a field of `handeye.solution.Solution`, filled by
+A gate is, under one name, a limit in `GateLimits` and a figure that `_measured` yields of the solution, with
+title, unit and remedy. A new figure is a field of `handeye.solution.Solution`, filled by
 `_describe` in `handeye.solve`. A gate without a value has a function of its own that `judge` calls, such as
 `_session_gate`.
 """
@@ -65,93 +65,86 @@ def judge(
     found = [_session_gate(solution)] if limits.session and solution.profile == "robust" else []
     if limits.arm and solution.profile == "robust":
         found.append(_arm_gate(solution.without_arm, limits.arm))
-    for name, value, title, remedy in _measured(solution, clock_bound_s):
+    for name, value, title, sense, unit, remedy in _measured(solution, clock_bound_s):
         limit = getattr(limits, name)
-        if value is None or limit is None:
-            continue
-        rule = _RULES[name]
-        text = f"{rule.title} {title}".rstrip()
-        found.append(Gate.measured(name, text, value, rule.sense, limit, rule.unit, remedy or rule.remedy))
+        if value is not None and limit is not None:
+            found.append(Gate.measured(name, title, value, sense, limit, unit, remedy))
     return tuple(found)
 
 
-class _Rule(NamedTuple):
+class _Figure(NamedTuple):
+    """What `Gate.measured` judges by the limit of this name."""
+
+    name: str
+    value: float | None
+    """In `unit`; None: not judged."""
     title: str
     """What is measured, for people."""
     sense: Sense
     unit: str
     """Of value and limit: m, deg, s, px, share; empty for plain numbers."""
-    remedy: str = ""
-    """Next step where the gate is closed; empty: `_measured` yields it with the value."""
+    remedy: str
+    """Next step where the gate is closed."""
 
 
 _ARM = "Check payload, mounting, looseness of board and camera, and the robot's calibrated kinematics."
-_RULES = {
-    "weight": _Rule("Mean view weight", "≥", "share", "Retake the rejected and suspect views."),
-    "views": _Rule("View count", "≥", "", "Capture more poses that show the board."),
-    "rotation_deg": _Rule("Rotation range", "≥", "deg", "Add poses with more tilt and roll."),
-    "axis_spread": _Rule("Rotation diversity", "≥", ""),
-    "view_rms_px": _Rule("Largest rms error of a view", "≤", "px"),
-    "holdout_share": _Rule("Held-out error", "≤", "share", "Check robot accuracy and corner detection."),
-    "cross_validation": _Rule(
-        "Cross-validated error",
-        "≤",
-        "",
-        "Check intrinsics, board and looseness of the mounts.",
-    ),
-    "predicted_error_m": _Rule("Predicted error", "≤", "m"),
-    "coverage": _Rule("Image coverage", "≥", "share", "Bring the board into the corners of the image."),
-    "clock_bound_s": _Rule("Time sync", "≤", "s", "Check the camera's clock, or use a hardware trigger."),
-    "lens_pull": _Rule(
-        "Shift by fixed intrinsics",
-        "≤",
-        "",
-        "Solve with --estimate-intrinsics, or calibrate the camera again.",
-    ),
-    "board_pull": _Rule(
-        "Shift by the stated board",
-        "≤",
-        "",
-        "Measure the squares both ways and the flatness, correct square_m and solve again.",
-    ),
-    "robot_error_m": _Rule("Position noise", "≤", "m", _ARM),
-    "robot_error_deg": _Rule("Orientation noise", "≤", "deg", _ARM),
-}
+_LENS = "Solve with --estimate-intrinsics, or calibrate the camera again."
+_BOARD = "Measure the squares both ways and the flatness, correct square_m and solve again."
 
 
-def _measured(
-    solution: Solution, clock_bound_s: float | None
-) -> Iterator[tuple[str, float | None, str, str]]:
-    """Yield each gate's id, value in its unit (None: not judged), end of its title, and own remedy or ""."""
+def _measured(solution: Solution, clock_bound_s: float | None) -> Iterator[_Figure]:
     seen, folds, noise = solution.observability, solution.cross_validation, solution.noise
-    predicted_m, distance_m = solution.predicted_error_m, solution.working_distance_m
-    weights = list(solution.weights.values())
-    yield "weight", float(np.mean(weights)) if weights else None, "", ""
-    yield "views", len(solution.used), "", ""
-    yield "rotation_deg", float(np.degrees(seen.largest_angle_rad)), "", ""
-    yield "axis_spread", seen.axis_spread, "", f"Add rotations about other axes: {seen.weakest_text}."
-    if solution.residual_px:
-        worst = max(solution.residual_px, key=lambda index: solution.residual_px[index])
+    distance_m, weights = solution.working_distance_m or 0.0, list(solution.weights.values())
+    weight = float(np.mean(weights)) if weights else None
+    yield _Figure(
+        "weight", weight, "Mean view weight", "≥", "share", "Retake the rejected and suspect views."
+    )
+    remedy = "Capture more poses that show the board."
+    yield _Figure("views", len(solution.used), "View count", "≥", "", remedy)
+    largest_deg = float(np.degrees(seen.largest_angle_rad))
+    remedy = "Add poses with more tilt and roll."
+    yield _Figure("rotation_deg", largest_deg, "Rotation range", "≥", "deg", remedy)
+    remedy = f"Add rotations about other axes: {seen.weakest_text}."
+    yield _Figure("axis_spread", seen.axis_spread, "Rotation diversity", "≥", "", remedy)
+    if px := solution.residual_px:
+        worst = max(px, key=lambda index: px[index])
+        title = f"Largest rms error of a view (pose {worst + 1})"
         remedy = f"Retake pose {worst + 1}, or check the intrinsics."
-        yield "view_rms_px", solution.residual_px[worst], f"(pose {worst + 1})", remedy
+        yield _Figure("view_rms_px", px[worst], title, "≤", "px", remedy)
     if solution.holdout is not None and distance_m:
         missed_m = solution.holdout.e_t_m
-        yield "holdout_share", missed_m / distance_m, f"({1e3 * missed_m:.2g} mm)", ""
+        title, remedy = (
+            f"Held-out error ({1e3 * missed_m:.2g} mm)",
+            "Check robot accuracy and corner detection.",
+        )
+        yield _Figure("holdout_share", missed_m / distance_m, title, "≤", "share", remedy)
     if folds is not None:
         figures = f"({folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm; 1 is what chance explains)"
-        yield "cross_validation", folds.rms_mm / folds.claimed_mm / folds.limit, figures, ""
+        ratio, remedy = (
+            folds.rms_mm / folds.claimed_mm / folds.limit,
+            "Check intrinsics, board and looseness of the mounts.",
+        )
+        yield _Figure("cross_validation", ratio, f"Cross-validated error {figures}", "≤", "", remedy)
+    title = f"Predicted error at {distance_m * 1e3:.0f} mm"
     remedy = f"Least known: {seen.weakest_text}. Add rotations about that direction."
-    yield "predicted_error_m", predicted_m, f"at {(distance_m or 0.0) * 1e3:.0f} mm", remedy
-    yield "coverage", solution.coverage if solution.lens_estimated else None, "", ""
-    yield "clock_bound_s", clock_bound_s, "", ""
-    for name, finding in (("lens_pull", solution.lens_finding), ("board_pull", solution.board_finding)):
+    yield _Figure("predicted_error_m", solution.predicted_error_m, title, "≤", "m", remedy)
+    coverage = solution.coverage if solution.lens_estimated else None
+    remedy = "Bring the board into the corners of the image."
+    yield _Figure("coverage", coverage, "Image coverage", "≥", "share", remedy)
+    remedy = "Check the camera's clock, or use a hardware trigger."
+    yield _Figure("clock_bound_s", clock_bound_s, "Time sync", "≤", "s", remedy)
+    for name, finding, title, remedy in (
+        ("lens_pull", solution.lens_finding, "Shift by fixed intrinsics", _LENS),
+        ("board_pull", solution.board_finding, "Shift by the stated board", _BOARD),
+    ):
         if finding is not None:
             of_mm = f"{finding.unexplained_m * 1e3:.2f} of {finding.pull_m * 1e3:.2f} mm"
-            figures = f"({of_mm} unexplained; 1 is the error of X)"
-            yield name, finding.unexplained_m / finding.error_m, figures, ""
+            title += f" ({of_mm} unexplained; 1 is the error of X)"
+            yield _Figure(name, finding.unexplained_m / finding.error_m, title, "≤", "", remedy)
     if noise is not None:
-        yield "robot_error_m", noise.robot_m, "", ""
-        yield "robot_error_deg", float(np.degrees(noise.robot_rad)), "", ""
+        yield _Figure("robot_error_m", noise.robot_m, "Position noise", "≤", "m", _ARM)
+        noise_deg = float(np.degrees(noise.robot_rad))
+        yield _Figure("robot_error_deg", noise_deg, "Orientation noise", "≤", "deg", _ARM)
 
 
 def _arm_gate(without: bool, limit: Literal["warn", "fail"]) -> Gate:

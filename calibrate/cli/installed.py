@@ -18,7 +18,7 @@ from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, read_calibration, write_output
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.exports.drivers import fixed_frames
-from calibrate.files.folders import cameras, current_version, readable_folder, validity_of
+from calibrate.files.folders import calibrations_folder, cameras, current_version, validity_of
 from calibrate.files.formatting import override_text, pose_text, summary, verdict_text
 from calibrate.files.integrity import read_bounded
 from calibrate.files.validity import LONGEST_AGE_DAYS, Validity, ValidityState, validity_text
@@ -42,7 +42,7 @@ def named_or_installed(
     """The calibration, and of the installed one its validity."""
     if file is not None:
         return read_calibration(file), None
-    folder = readable_folder(root, camera)
+    folder = calibrations_folder(root, camera)
     number, path = current_version(folder)
     return read_calibration(path), validity_of(folder, number)
 

@@ -25,33 +25,29 @@ def calibrations_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> P
     return folder if camera == MAIN_CAMERA else folder / "cameras" / camera
 
 
-def readable_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
-    """Return the folder of a camera's installed calibrations; InstallError where it is not readable."""
-    folder = calibrations_folder(root, camera)
-    try:
-        (folder / "gen").exists()
-    except PermissionError as problem:
-        raise InstallError("state-folder", path=folder, why=problem.strerror) from None
-    return folder
-
-
 def cameras(root: Path | str | None = None) -> list[str]:
     """List the cameras for which something was ever installed below `root`, `main` first."""
-    folder = readable_folder(root)
+    folder = calibrations_folder(root)
+    current_name(folder)  # raises where nothing may be read
     others = sorted(path.parent.name for path in (folder / "cameras").glob("*/gen"))
     return [*([MAIN_CAMERA] if (folder / "gen").is_dir() else []), *filter(is_session_name, others)]
 
 
 def current_name(folder: Path) -> str:
-    """Return the file name of the current version; empty where nothing is installed."""
+    """Return the file name of the current version; empty where nothing is installed.
+
+    InstallError where the folder is not readable.
+    """
     try:
         return (folder / "current").readlink().name
+    except PermissionError as problem:
+        raise InstallError("state-folder", path=folder, why=problem.strerror) from None
     except OSError:
         return ""
 
 
 def current_version(folder: Path) -> tuple[int, Path]:
-    """Return number and file of the current version. InstallError when nothing is installed."""
+    """Return number and file of the current version. InstallError as `current_name`, or without one."""
     name = current_name(folder)
     match = VERSION_NAME.fullmatch(name)
     if match is None:
@@ -63,11 +59,6 @@ def read_validity(folder: Path) -> dict[int, Validity]:
     """Read the last validity record of each version. Raises OSError."""
     path = folder / FILE
     return parse_validity(read_file(path, LOG_LIMIT_BYTES)) if path.exists() else {}
-
-
-def current_validity(folder: Path) -> Validity:
-    """Read the current version's validity now. InstallError without one."""
-    return validity_of(folder, current_version(folder)[0])
 
 
 def validity_of(folder: Path, number: int) -> Validity:

@@ -16,10 +16,9 @@ from calibrate.errors import GateFailedError, InstallError, require_choice, requ
 from calibrate.files.calibration import Calibration, Override, read_calibration
 from calibrate.files.folders import (
     calibrations_folder,
-    current_validity,
     current_version,
     read_validity,
-    readable_folder,
+    validity_of,
 )
 from calibrate.files.lines import append_line
 from calibrate.files.touch import agrees, touch_text
@@ -31,6 +30,7 @@ from calibrate.files.validity import (
     ValidityReason,
     ValidityState,
     time_text,
+    unrecorded,
 )
 from calibrate.files.versions import (
     InstalledVersion,
@@ -68,7 +68,7 @@ def installed_calibration(root: Path | None = None, camera: str = MAIN_CAMERA) -
     Raises InstallError when nothing is installed, CalibrationFileError when it is damaged. Programs that use
     the camera should call `load_installed`, which checks both.
     """
-    return read_calibration(current_version(readable_folder(root, camera))[1])
+    return read_calibration(current_version(calibrations_folder(root, camera))[1])
 
 
 def install(
@@ -167,7 +167,7 @@ def rollback(
         numbered = next((g for g in known if g.number == to), None)
         target = before_current(known, read_log(root, camera)) if to is None else numbered
         if target is None and to is None:
-            withdrawn = current_validity(folder).state is ValidityState.WITHDRAWN
+            withdrawn = validity_of(folder, current_version(folder)[0]).state is ValidityState.WITHDRAWN
             withdraw_it = f"To take it out of use: {_withdraw_line(root, camera)}"
             advice = f"{WITHDRAWN_REMEDY}." if withdrawn else withdraw_it
             raise InstallError("nothing-older", folder=folder, advice=advice)
@@ -259,12 +259,12 @@ def _change_validity(
     root: Path | None, camera: str, version: int | None, change: Callable[[Validity], Validity]
 ) -> Validity:
     folder = calibrations_folder(root, camera)
-    current_version(readable_folder(root, camera))  # raises first, so that no folder is created in vain
+    current_version(folder)  # raises first, so that no folder is created in vain
     with locked(folder):
         number, _ = current_version(folder)
         if version not in (None, number):
             raise InstallError("other-version", folder=folder, version=number, judged=version)
-        before = read_validity(folder).get(number, current_validity(folder))
+        before = read_validity(folder).get(number) or unrecorded(number)
         after = change(before)
         if after != before:
             append_line(folder / VALIDITY_FILE, after)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibrate.errors import CalibrationError, CalibrationFileError, InstallError
-from calibrate.files.folders import calibrations_folder, current_version, readable_folder, validity_of
+from calibrate.files.folders import calibrations_folder, current_version, validity_of
 from calibrate.files.integrity import check_result, read_bounded, verified_plain
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, require_usable, time_text
 from calibrate.geometry import Array, Transform
@@ -129,7 +129,7 @@ def load_installed(
 
 
 def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
-    folder = readable_folder(root, camera)
+    folder = calibrations_folder(root, camera)
     number, path = current_version(folder)
     plain = verified_plain(read_bounded(path), str(path))
     try:

@@ -37,7 +37,6 @@ from calibrate.files.folders import (
     calibrations_folder,
     current_name,
     read_validity,
-    readable_folder,
 )
 from calibrate.files.integrity import read_bounded
 from calibrate.files.lines import append_line, read_lines, share
@@ -87,7 +86,7 @@ def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> l
 
     InstallError where the folder is not readable.
     """
-    folder = readable_folder(root, camera)
+    folder = calibrations_folder(root, camera)
     current, recorded, now = current_name(folder), read_validity(folder), datetime.now(UTC)
     found = []
     for path in sorted((folder / "gen").glob("*.yaml")):
@@ -141,9 +140,10 @@ def read_log(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[LogEnt
 
     A line is written before its switch. Where a crash prevented that, another version is replaced next.
     """
-    folder = readable_folder(root, camera)
+    folder = calibrations_folder(root, camera)
+    current = _current_number(folder)
     entries = [line.switch for line in read_lines(folder / VALIDITY_FILE, _Line) if line.switch is not None]
-    current_after = [*(entry.replaced for entry in entries[1:]), _current_number(folder)]
+    current_after = [*(entry.replaced for entry in entries[1:]), current]
     pairs = zip(entries, current_after, strict=False)
     return [entry for entry, number in pairs if number in (entry.generation, None)]
 

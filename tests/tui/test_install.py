@@ -13,7 +13,7 @@ from textual.widgets import Input, Static
 from textual.widgets._footer import FooterKey
 
 from calibrate.files.calibration import Calibration, read_calibration, write_calibration
-from calibrate.files.folders import calibrations_folder, current_validity
+from calibrate.files.folders import calibrations_folder, validity_of
 from calibrate.files.formatting import figures, summary
 from calibrate.files.install import install, installed_calibration
 from calibrate.files.touch import Touch
@@ -141,13 +141,13 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
         await pilot.press("4")
         for answer in ("escape", "enter"):
             await until(pilot, lambda: "INSTALLED" in text_of(pilot.app, "#verdict"))
-            assert current_validity(calibrations_folder(root)).state == "valid"
+            assert validity_of(calibrations_folder(root), 1).state == "valid"
             await pilot.press("b")
             await until(pilot, lambda: isinstance(pilot.app.screen, Reason) and pilot.app.screen.query(Input))
             pilot.app.screen.query_one(Input).value = "the bracket was loose"
             await pilot.press(answer)
             await until(pilot, lambda: not isinstance(pilot.app.screen, Reason))
-        await until(pilot, lambda: current_validity(calibrations_folder(root)).state == "withdrawn")
+        await until(pilot, lambda: validity_of(calibrations_folder(root), 1).state == "withdrawn")
         await until(pilot, lambda: "withdrawn" in text_of(pilot.app, "#verdict"))
         assert next_action(pilot.app.known).key != "d"
         await pilot.press("b")

@@ -174,7 +174,7 @@ def test_a_place_that_may_not_be_looked_into_is_said(
     def refused(path: Path) -> bool:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "exists", refused)  # who runs the tests may be root
+    monkeypatch.setattr(Path, "readlink", refused)  # who runs the tests may be root
     with raises("state-folder", InstallError):
         look(tmp_path)
 

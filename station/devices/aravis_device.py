@@ -52,12 +52,14 @@ def _aravis() -> tuple[Any, Any]:
 class GenicamDevice:
     """One GenICam camera; blocking, for use by one thread. All methods raise CameraError."""
 
+    _applied: Applied
+    """Set by `open`."""
+
     def __init__(self, config: CameraConfig) -> None:
         self._config = config
         self._aravis, self._glib = _aravis()
         self._camera: Any = None
         self._stream: Any = None
-        self._applied: Applied | None = None
         self._latched_ns: int | None = None
         self._controls = False
         self._lost = False
@@ -134,15 +136,9 @@ class GenicamDevice:
 
         A gain in another unit is returned as 0 dB; its value is part of `settings`.
         """
-        applied = self._require_applied()
         with self._explained("reading the camera's settings"):
-            exposure_us, gain = require_settings(self._camera, self._config.exposure_us, applied)
-        return exposure_us, gain if applied.gain_in_db else 0.0
-
-    def _require_applied(self) -> Applied:
-        if self._applied is None:
-            raise CameraError("not-open")
-        return self._applied
+            exposure_us, gain = require_settings(self._camera, self._config.exposure_us, self._applied)
+        return exposure_us, gain if self._applied.gain_in_db else 0.0
 
     def latch(self, clock: DeviceClock) -> None:
         """Add a reading of the camera's clock to `clock`, where the camera supports latching it."""
@@ -200,7 +196,7 @@ class GenicamDevice:
             self._stream.push_buffer(buffer)
 
     def _picture(self, buffer: Any) -> Image:
-        applied = self._require_applied()
+        applied = self._applied
         if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
             self._calm_down()
             raise CameraError("frame-incomplete", reason=buffer.get_status().value_nick)

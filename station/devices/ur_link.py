@@ -198,11 +198,9 @@ class UrLink:
 
         Waiting data are read first, so that a busy computer does not make news old.
         """
-        age_s = self._age_s()
-        if age_s > CURRENT_S and self.reader is not None:
+        if self.reader is not None and self._age_s() > CURRENT_S:
             self.reader.read()
-            age_s = self._age_s()
-        return age_s
+        return self._age_s()
 
     def _age_s(self) -> float:
         return (time.monotonic_ns() - self._arrived_ns) / 1e9 if self._arrived_ns else float("inf")

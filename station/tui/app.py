@@ -143,7 +143,7 @@ class StationApp(LivePageApp[None], DaemonApp):
             return
         self.known = replace(self.known, status=status, gone="")
         if before is None or before.session.recording != status.session.recording:
-            self.action_look_at_disk()
+            self.look_at_disk()
         if before is not None and before.session.name and not status.session.name:
             self.result_path = ""  # another session begins: what was looked at is no part of it
         elif status.guidance.outline and before is not None and _one_more(before.session, status.session):
@@ -162,9 +162,9 @@ class StationApp(LivePageApp[None], DaemonApp):
             self.known = replace(self.known, checks=tuple(checks))
 
     def watch_result_path(self) -> None:
-        self.action_look_at_disk()
+        self.look_at_disk()
 
-    def action_look_at_disk(self) -> None:
+    def look_at_disk(self) -> None:
         self._marks = None
         self._look.set()
 

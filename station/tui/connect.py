@@ -52,7 +52,6 @@ class ConnectScreen(StationScreen):
     """The preflight check, looked at again while something is missing."""
 
     MODE, TIP = "connect", "What is missing, and its remedy"
-    LOOK = "look_at_checks"
 
     def on_mount(self) -> None:
         self.query_one("#checklist-scroll").border_title = "What a capture needs"
@@ -64,6 +63,9 @@ class ConnectScreen(StationScreen):
                 yield Line(lambda known, width: checklist_text(known.checks, width), id="checklist")
             with Box("Camera", id="connect-picture", below="o: in a browser"):
                 yield PreviewPane(id="preview")
+
+    async def on_screen_resume(self) -> None:
+        await self.app.run_action("look_at_checks")
 
     async def look_again(self) -> None:
         """Check again while something is missing, whatever is shown; an arm at work is left in peace."""

@@ -182,7 +182,6 @@ class ResultScreen(StationScreen):
     """The newest calibration, or the one picked from the sessions."""
 
     MODE, TIP = "result", "The verdict, its checks, install and undo"
-    LOOK = "look_at_disk"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("i", "act('install')", "Install", tooltip="Make this the cell's calibration; b undoes it"),
         Binding("b", "act('undo')", "Undo", tooltip="Back to the calibration before, or none"),

@@ -85,9 +85,6 @@ class StationScreen(Framed[None]):
     TIP: ClassVar[str] = ""
     """Purpose in a few words."""
 
-    LOOK: ClassVar[str] = ""
-    """Action of the app that reads what this screen shows."""
-
     @property
     def link(self) -> DaemonLink:
         """The daemon, as every screen asks it."""
@@ -106,10 +103,6 @@ class StationScreen(Framed[None]):
 
     def body(self) -> ComposeResult:
         yield from ()
-
-    async def on_screen_resume(self) -> None:
-        if self.LOOK:
-            await self.app.run_action(self.LOOK)
 
     def does_something(self, action: str) -> bool:
         return action != f"switch_mode('{self.MODE}')" and super().does_something(action)

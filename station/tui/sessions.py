@@ -25,7 +25,6 @@ class SessionsScreen(StationScreen):
     """Past recordings and their calibrations."""
 
     MODE, TIP = "sessions", "Past recordings"
-    LOOK = "look_at_disk"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f9", "act('solve')", "Solve", tooltip="Solve this recording again, outside the daemon"),
         Binding("enter", "act('show')", "Result", show=False, tooltip="Show this session's calibration"),

@@ -92,6 +92,8 @@ class FakeLink(Client):
         self.answers: dict[str, Any] = {"prepare": SUMMARY, "preview": _image()}
         self.silent = asyncio.Event()
         """While set nothing is answered, as by a daemon that hangs."""
+        self.slow: dict[str, asyncio.Event] = {}
+        """By the name of a verb: what its answer waits for."""
         self.same_image, self._images = False, 0
         self._serves = False
         self.show(idle())
@@ -120,6 +122,8 @@ class FakeLink(Client):
         self.asked.append(msgspec.convert(args, VERBS[verb]))
         while self.silent.is_set():
             await asyncio.sleep(0.01)
+        if verb in self.slow:
+            await self.slow[verb].wait()
         if verb in self.refuse:
             raise self.refuse[verb]
         answer = self.answers.get(verb, Done())

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from textual.pilot import Pilot
 
 from calibrate.check.history import CheckEntry, append_check
 from calibrate.files.calibration import write_calibration
@@ -18,7 +17,7 @@ from station.protocol import verbs
 from station.tui import jobs
 from station.tui.dialogs import ConfirmMotion, JobScreen
 from station.tui.installed import read_installed
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, said, text_of, until
+from tests.tui.conftest import FakeLink, idle, in_session, opened, said, text_of, until
 from tests.tui.test_install import GOOD
 
 CHECK_PLAN = "cd" * 32
@@ -51,25 +50,19 @@ def check_session(root: Path, recording: str = "", state: StationState = Station
     return in_session(idle(state), name="s-2", check=True, folder=folder, recording=recording)
 
 
-async def ask_for_it(pilot: Pilot[None]) -> None:
-    await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-    await pilot.press("4", "d")
-
-
 async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp_path: Path) -> None:
     link.root = tmp_path
-    app = app_on(link)
-    async with app.run_test(size=(80, 24), notifications=True) as pilot:
-        await ask_for_it(pilot)
+    async with opened(link, notifications=True) as pilot:
+        await pilot.press("4", "d")
         await until(pilot, lambda: str(link.root) in said(pilot))
         assert link.verbs == []
 
 
 async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, installed: Path) -> None:
     recording = str(installed / "root/sessions/s-2/session.mcap")
-    app = app_on(link)
-    async with app.run_test(size=(80, 24), notifications=True) as pilot:
-        await ask_for_it(pilot)
+    async with opened(link) as pilot:
+        app = pilot.app
+        await pilot.press("4", "d")
         await until(pilot, lambda: isinstance(app.screen, ConfirmMotion))
         assert "go" not in link.verbs
         assert verbs.Prepare(verbs.Purpose.DRIFT_CHECK) in link.asked

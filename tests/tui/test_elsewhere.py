@@ -6,7 +6,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from textual.pilot import Pilot
 from textual.widgets import DataTable
 
 from calibrate.check.history import CheckEntry, append_check
@@ -15,7 +14,6 @@ from calibrate.files.folders import calibrations_folder
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
 from station.tui import app as app_module
-from station.tui.app import StationApp
 from station.tui.installed import read_installed
 from station.tui.task import next_action
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, text_of, until
@@ -42,17 +40,12 @@ def put(root: Path, session: str) -> None:
     install(root / "sessions" / session / "calibration.yaml", root, cell="simulated")
 
 
-async def list_of_sessions(app: StationApp, pilot: Pilot[None]) -> DataTable[str]:
-    await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-    await pilot.press("5")
-    await until(pilot, lambda: app.current_mode == "sessions")
-    return app.screen.query_one(DataTable)
-
-
 async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, root: Path) -> None:
-    app = app_on(link)
-    async with app.run_test(size=(80, 24)) as pilot:
-        table = await list_of_sessions(app, pilot)
+    async with opened(link) as pilot:
+        app = pilot.app
+        await pilot.press("5")
+        await until(pilot, lambda: app.screen.query(DataTable))
+        table = app.screen.query_one(DataTable)
 
         def states() -> list[str]:
             return [str(table.get_row_at(line)[1]) for line in range(table.row_count)]

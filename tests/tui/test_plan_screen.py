@@ -12,29 +12,15 @@ from station.tui.daemon_link import BUSY
 from tests.tui.conftest import FakeLink, idle, in_session, opened, said, text_of, until
 
 
-class SlowPlanner(FakeLink):
-    """Makes a plan when it is told to."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.made = asyncio.Event()
-
-    async def request(self, verb: str, *, timeout_s: float = 0.0, **args: object) -> object:
-        answer = await super().request(verb, **args)
-        if verb == "make_plan":
-            await self.made.wait()
-        return answer
-
-
-async def test_it_says_that_it_plans_for_as_long_as_it_does() -> None:
-    link = SlowPlanner()
+async def test_it_says_that_it_plans_for_as_long_as_it_does(link: FakeLink) -> None:
+    made = link.slow["make_plan"] = asyncio.Event()
     async with opened(link, notifications=True) as pilot:
         await pilot.press("2", "n")
         await until(pilot, lambda: BUSY[verbs.MakePlan] in text_of(pilot.app, "#next"))
         await pilot.press("n")
         await until(pilot, lambda: "Busy" in said(pilot))
         assert link.verbs.count("make_plan") == 1
-        link.made.set()
+        made.set()
         await until(pilot, lambda: "Wait" not in text_of(pilot.app, "#next"))
 
 

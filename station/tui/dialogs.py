@@ -18,7 +18,7 @@ from textual.widgets import Button, Input, Label, RichLog, Static
 from calibrate.files.install import reason_problem
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
-from station.tui.frame import Frame, Question
+from station.tui.frame import Question
 from station.tui.screen import Panel
 from station.tui.task import Action, Known
 from station.tui.widgets.cell_drawing import draw
@@ -194,7 +194,7 @@ class JobScreen(Question[int]):
             self.dismiss(self._exit_code if self._exit_code in self._close_on else -1)
             return
         self.query_one("#job-title", Label).update(self._title)
-        self.query_one(Frame).question = READ  # the person reads why before it goes away
+        self.NEXT = READ  # the person reads why before it goes away
         self.show(self.known)
 
     def action_close(self) -> None:

@@ -83,19 +83,9 @@ class Line(Static):
 class Frame(Horizontal):
     """The first rows of every screen and of every question over it."""
 
-    def __init__(self, title: str, mode: str, question: Action | None = None) -> None:
-        super().__init__(classes="frame")
-        self._title, self._mode, self.question = title, mode, question
-
-    def compose(self) -> ComposeResult:
-        with Vertical(classes="head"):
-            yield Line(lambda known, width: bar_line(known, self._title, width), id="bar")
-            yield Line(lambda known, width: rail_line(steps(known), self._mode, width), id="rail")
-            yield Line(self._next, id="next")
-        yield StopBlock(id="stop")
-
-    def _next(self, known: Known, width: int) -> Content:
-        return next_line(self.question or next_action(known).on(self._mode), width)
+    def __init__(self, *lines: Static) -> None:
+        """`lines`: with the ids bar, rail and next."""
+        super().__init__(Vertical(*lines, classes="head"), StopBlock(id="stop"), classes="frame")
 
 
 def bar_line(known: Known, title: str, width: int) -> Content:
@@ -235,9 +225,24 @@ class Framed(Screen[R]):
     """A screen or a question below the frame, drawn again whenever the app knows something new."""
 
     AUTO_FOCUS = ""
+    MODE: ClassVar[str] = ""
+    """Its step of the rail, or its name; empty: a question."""
+    NAME: ClassVar[str] = ""
+    NEXT: Action | None = None
+    """In place of the one next action."""
     known = Known()
     """What the app knew when this was drawn last."""
     HORIZONTAL_BREAKPOINTS, VERTICAL_BREAKPOINTS = BREAKPOINTS
+
+    def frame(self) -> Frame:
+        return Frame(
+            Line(lambda known, width: bar_line(known, self.NAME or self.MODE.title(), width), id="bar"),
+            Line(lambda known, width: rail_line(steps(known), self.MODE, width), id="rail"),
+            Line(self._next, id="next"),
+        )
+
+    def _next(self, known: Known, width: int) -> Content:
+        return next_line(self.NEXT or next_action(known).on(self.MODE), width)
 
     @property
     def active_bindings(self) -> dict[str, ActiveBinding]:
@@ -290,8 +295,7 @@ class Question(ModalScreen[R], Framed[R]):
     """A window over a screen, below the same frame: STOP stays where it is."""
 
     AUTO_FOCUS = "*"
-    NAME: ClassVar[str] = "Question"
-    NEXT: ClassVar[Action | None] = ANSWER
+    NAME, NEXT = "Question", ANSWER
     BOX: ClassVar[str] = "dialog"
 
     def __init__(self, title: str = "", words: str = "") -> None:
@@ -299,7 +303,7 @@ class Question(ModalScreen[R], Framed[R]):
         self.title, self.words = title or self.TITLE, words
 
     def compose(self) -> ComposeResult:
-        yield Frame(self.NAME, "", self.NEXT)
+        yield self.frame()
         with Container(id="question"), Vertical(id=self.BOX):
             yield from self.body()
         yield Footer(compact=True, show_command_palette=False)

@@ -27,7 +27,7 @@ from station.cell.status import DetectionStatus
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
-from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
+from station.tui.frame import BREAKPOINTS, Frame, StopBlock, fitting, next_line, rail_line
 from station.tui.live_page import LivePageApp, news
 from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
 from station.tui.task import Step
@@ -78,11 +78,7 @@ class NewCell(LivePageApp[Ending]):
         """The camera, or the search for one, failed at the last look; when cameras were searched last."""
 
     def compose(self) -> ComposeResult:
-        with Horizontal(classes="frame"):
-            with Vertical(classes="head"):
-                for line in ("bar", "rail", "next"):
-                    yield Static(id=line)
-            yield StopBlock(id="stop")
+        yield Frame(*(Static(id=line) for line in ("bar", "rail", "next")))
         with Vertical(id="work"):
             yield Static(id="title")
             yield Static(id="about", markup=False)

@@ -15,7 +15,7 @@ from textual.widgets import DataTable, Footer
 from station.protocol.client import ANSWER_S
 from station.protocol.verbs import Verb
 from station.tui.daemon_link import DaemonApp, DaemonLink
-from station.tui.frame import Frame, Framed, Line
+from station.tui.frame import Framed, Line
 from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import rich_text
@@ -80,8 +80,6 @@ class StationScreen(Framed[None]):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f1", "app.command_palette", "Help", tooltip="Every action and its key, to search in")
     ]
-    MODE: ClassVar[str] = ""
-    """Its step of the rail, or its name."""
     TIP: ClassVar[str] = ""
     """Purpose in a few words."""
 
@@ -96,7 +94,7 @@ class StationScreen(Framed[None]):
         self.run_worker(self.link.ask(verb, timeout_s=timeout_s), group="command", exit_on_error=False)
 
     def compose(self) -> ComposeResult:
-        yield Frame(self.MODE.title(), self.MODE)
+        yield self.frame()
         with Container(id="content"):
             yield from self.body()
         yield Footer(compact=True, show_command_palette=False)

@@ -139,12 +139,17 @@ class Recording:
         )
 
     def robot_samples(self) -> RobotSamples:
-        """All robot states as arrays, to be interpolated at any time."""
+        """All robot states as arrays, to be interpolated at any time.
+
+        RecordingError where the computer restarted between two segments: their stamps are of two clocks.
+        """
         states = list(self.robot_states())
         counts = {len(state.joints_rad) for state in states}
         count = counts.pop() if len(counts) == 1 else 0
         joints = np.array([state.joints_rad[:count] for state in states], dtype=float)
         stamps = np.array([state.stamps.host_monotonic_ns for state in states], np.int64)
+        if len(self.segments) > 1 and (np.diff(stamps) < 0).any():
+            raise RecordingError("clock-restarted", path=self.path)
         poses = np.array([state.tcp_pose for state in states]).reshape(-1, 6)
         return RobotSamples(stamps, joints.reshape(len(states), count), poses)
 

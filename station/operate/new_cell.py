@@ -219,7 +219,7 @@ def write_config(draft: Draft, path: Path) -> StationConfig:
     config = made_config(draft)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists():
-        path.replace(path.with_name(path.name + ".before"))
+        path.with_name(path.name + ".before").write_bytes(path.read_bytes())
     write_atomically(path, config_text(config).encode(), ASKED_FOR)
     written, _ = load_config(path)
     if not draft.posted:

@@ -139,6 +139,7 @@ async def _write(context: SessionContext, index: int, image: Image, view: View, 
         queue.note(index, corners=sighting.status.corners, coverage=sighting.status.coverage)
         context.store.update(detection=sighting.status)
         flange = np.array(view.base_from_flange)
+        context.seen.pop(index, None)  # the newest comes last
         context.seen[index] = CapturedView(index, flange, sighting.indices, sighting.pixels)
     queue.mark(index, "done")
     await recording.save_state(queue)

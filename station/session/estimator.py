@@ -10,6 +10,7 @@ from recordings.errors import RecordingError
 from station.analysis.estimation import running_estimate, seen_before
 from station.analysis.found_cell import odd_view
 from station.analysis.pool import WorkerError
+from station.analysis.worker import CapturedView
 from station.cell.status import EstimateStatus
 from station.session.context import SessionContext
 from station.session.recording import stamps_now
@@ -25,12 +26,12 @@ class Estimator:
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
-        self._known: tuple[int, ...] = ()
+        self._known: tuple[CapturedView, ...] = ()
         self._woken = asyncio.Event()
 
     def poke(self) -> None:
         """Request an update; cheap."""
-        if tuple(self._context.seen) != self._known:
+        if tuple(self._context.seen.values()) != self._known:  # also where a pose was captured again
             self._woken.set()
 
     async def run(self) -> None:
@@ -38,8 +39,8 @@ class Estimator:
         while True:
             await self._woken.wait()
             self._woken.clear()
-            self._known, seen = tuple(context.seen), list(context.seen.values())
-            if not self._known:
+            self._known = seen = tuple(context.seen.values())
+            if not seen:
                 context.store.update(estimate=EstimateStatus())
                 continue
             recorded = None if context.recording is None else context.recording.camera
@@ -63,7 +64,7 @@ class Estimator:
             if odd is not None:
                 context.store.problem(odd, "warning", seen[-1].index)
             if queue is not None and queue is context.queue:
-                queue.note(self._known[-1], estimated_sigma_mm=estimate.predicted_error_mm)
+                queue.note(seen[-1].index, estimated_sigma_mm=estimate.predicted_error_mm)
                 context.store.update_session(poses=queue.statuses)
             if (recording := context.recording) is not None:
                 with contextlib.suppress(RecordingError):  # a full disk is reported by the run

@@ -153,17 +153,17 @@ class SessionRecording:
         recorder = Recorder(path, info)
         try:
             enter_part(self.folder, info.name, info.part, path.name)
+            recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
+            recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
+            recorder.attach("camera.json", "application/json", msgspec.json.encode(settings))
+            if (kinematics := self._cell.arm.kinematics) is not None:
+                recorder.attach(ARM_KINEMATICS_NAME, "application/json", msgspec.json.encode(kinematics))
+            for name, content in self._cell.attachments.items():
+                recorder.attach(name, "application/json", content)
+            recorder.camera_model(info.camera)
         except RecordingError:
             recorder.close()
             raise
-        recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
-        recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
-        recorder.attach("camera.json", "application/json", msgspec.json.encode(settings))
-        if (kinematics := self._cell.arm.kinematics) is not None:
-            recorder.attach(ARM_KINEMATICS_NAME, "application/json", msgspec.json.encode(kinematics))
-        for name, content in self._cell.attachments.items():
-            recorder.attach(name, "application/json", content)
-        recorder.camera_model(info.camera)
         self.camera = info.camera
         self.recorder = recorder
         camera, board = (

@@ -39,6 +39,10 @@ def test_a_resumed_session_is_one_recording(tmp_path: Path) -> None:
     for view, picture in recording.images():
         np.testing.assert_array_equal(picture.pixels, make_image(100 * view.index + view.attempt))
     assert len(list(recording.robot_states())) == 4
+    with refused("clock-restarted"):  # the second part's stamps begin anew
+        recording.robot_samples()
+    for part in ("session.mcap", "session-2.mcap"):
+        assert len(open_recording(tmp_path / part, incomplete=True).robot_samples().stamps_ns) == 2
     assert recording.attachments() == {"plan.yaml": b"session-2.mcap"}
     assert len(recording.sha256) == 64
 

@@ -19,7 +19,7 @@ from station.analysis.estimation import seen_before
 from station.analysis.worker import BoardDetection, sight
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.verbs import Purpose
+from station.protocol.verbs import Purpose, Retake
 from tests.durability import full
 from tests.patience import until
 from tests.station.quick_plan import quick_plan
@@ -109,6 +109,18 @@ async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate(
     await again.go_until(S.IDLE, purpose=Purpose.RESUME)
     assert again.session.store.status.session.elapsed_s > elapsed_s
     assert [view.index for view in sealed(again).views()] == list(range(POSES))
+
+
+async def test_a_pose_that_is_captured_again_counts_as_it_is_now(half_way: Rig) -> None:
+    store = half_way.session.store
+    await until(lambda: store.status.estimate.views == BEFORE)
+    before = store.status.estimate.camera_pose
+    await half_way.session.edit(1, Retake(0))
+    half_way.arm.slow = True
+    await half_way.go_until(S.MOVING, purpose=Purpose.RESUME)
+    await half_way.pause_after_this_pose("anna")
+    await until(lambda: store.status.estimate.camera_pose != before)
+    assert store.status.estimate.views == BEFORE
 
 
 async def test_nothing_moves_by_poses_that_the_disk_did_not_take(

@@ -115,24 +115,17 @@ def test_a_weakness_is_found_only_where_it_is() -> None:
     assert not any(failed(stand.test(way)) for way in StopWay if way is not StopWay.FROZEN)
 
 
-def test_few_samples_a_gap_and_a_stop_that_was_not_given_are_not_measured() -> None:
-    stand = Stand()
+def test_few_samples_a_gap_no_stop_and_an_arm_that_stood_still_are_not_measured() -> None:
+    stand, still = Stand(), Stand()
     stand.test(StopWay.CONTROL)
+    still.run(3.0)
     states, move = stand.states, stand.move
     stop = next(i for i, s in enumerate(states) if s.stamps.host_monotonic_ns >= stand.stopped_ns)
     late = [s for i, s in enumerate(states) if not stop + 5 < i < stop + 40]
-    for samples, moment_ns in (([], stand.stopped_ns), (late, stand.stopped_ns), (states, None)):
+    at_rest = still.states, still.states[500].stamps.host_monotonic_ns
+    for samples, moment_ns in (([], stand.stopped_ns), (late, stand.stopped_ns), (states, None), at_rest):
         figures, not_measured = judge(samples, move, moment_ns)
         assert not figures and not_measured
-
-
-def test_an_arm_that_stood_still_tells_nothing_of_its_stops() -> None:
-    stand = Stand()
-    stand.run(3.0)
-    moment_ns = stand.states[500].stamps.host_monotonic_ns
-    move = StopTestMove(StopWay.CONTROL, SUBJECT, 0, START[0] + TURN_RAD, FAST_RAD_S)
-    figures, not_measured = judge(stand.states, move, moment_ns)
-    assert not figures and not_measured
 
 
 @pytest.mark.parametrize("weakness", ["hidden-protective-stop", "too-fast"])

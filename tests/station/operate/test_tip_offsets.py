@@ -11,13 +11,11 @@ import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.check.board_now import locate_board, offset_covariance
-from calibrate.errors import CalibrationError
 from calibrate.files.calibration import write_calibration
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig, matrix4
-from station.cell.errors import RefusedError
 from station.cell.status import RobotStatus, StationStatus
 from station.operate.tip_offsets import SeenBoard, read_touch, see_board
 from station.protocol.verbs import Observation, Observe
@@ -123,7 +121,7 @@ async def test_a_tip_off_the_board_or_at_another_corner_is_no_touch(
     assert refused.value.values["distance_m"] == pytest.approx(max(map(abs, beside)), abs=1e-4)
 
 
-async def test_what_is_not_known_is_refused(tmp_path: Path) -> None:
+async def test_what_is_not_known_and_another_cell_are_refused(tmp_path: Path) -> None:
     daemon = Daemon()
     board = await daemon.seen(tmp_path)
     for status in (None, StationStatus()):
@@ -131,19 +129,13 @@ async def test_what_is_not_known_is_refused(tmp_path: Path) -> None:
             read_touch(board, CORNER, status)
     bare = Daemon(tcp_offset=(0.0,) * 6)
     bare.config = msgspec.structs.replace(bare.config, pointer=None)
-    with raises("no-pointer"):
-        await bare.seen(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("changes", "error"),
-    [({"corners": (), "pixels": ()}, RefusedError), ({"camera_serial": "3"}, CalibrationError)],
-)
-async def test_no_board_and_another_cell_are_refused(
-    changes: dict[str, object], error: type[Exception], tmp_path: Path
-) -> None:
-    with pytest.raises(error):
-        await Daemon(**changes).seen(tmp_path)
+    for other, code in (
+        (bare, "no-pointer"),
+        (Daemon(corners=(), pixels=()), "no-board"),
+        (Daemon(camera_serial="3"), "views-of-another-cell"),
+    ):
+        with raises(code):
+            await other.seen(tmp_path)
 
 
 def test_the_predicted_offset_is_what_repetitions_show() -> None:

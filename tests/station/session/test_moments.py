@@ -11,6 +11,7 @@ import pytest
 from station.cell import limits
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
+from station.cli.session import STOP_ANSWER_S
 from station.protocol.verbs import Purpose, Skip
 from station.session import run, session
 from tests.codes import raises
@@ -142,7 +143,8 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
 ) -> None:
     monkeypatch.setattr(session, "END_RUN_S", 0.05)
     await rig.go_until(S.WRITING)
-    await rig.session.stop("bert")
+    await asyncio.wait_for(rig.session.stop("bert"), STOP_ANSWER_S)  # else `station capture` says: no answer
+    assert "stop" in rig.arm.log
     await rig.session.acknowledge("anna")
     assert rig.state is S.PAUSED
     for what in (
@@ -155,4 +157,4 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
     assert rig.session.context.requests.halt
     held_disk.set()
     await until(lambda: rig.session._run is not None and rig.session._run.done())
-    assert rig.arm.log.count("move") == 1
+    assert rig.arm.log.count("move") == 1 and "done" in rig.pose_states

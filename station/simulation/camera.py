@@ -39,10 +39,11 @@ class RenderedCamera:
     ) -> None:
         """`flange`: returns base_from_flange (4, 4) of a posted arm; None: the controller is asked for it."""
         self._flange = flange
+        if config is not None:
+            changes = {"exposure_us": config.exposure_us, "gain_db": config.gain_db}
+            truth = msgspec.structs.replace(truth, light=msgspec.structs.replace(truth.light, **changes))
         self._truth = truth
         self._host = controller_host
-        self._exposure_us = truth.exposure_us if config is None else config.exposure_us
-        self._gain_db = truth.gain_db if config is None else config.gain_db
         self._process: subprocess.Popen[bytes] | None = None
         self._thread = DeviceThread("rendered camera")
         self._asking = asyncio.Lock()
@@ -78,8 +79,7 @@ class RenderedCamera:
     async def _open(self) -> None:
         self.counter.restart()
         await self._thread.run(self._start)
-        setup = (self._truth, self._host, self._exposure_us, self._gain_db)
-        await self._call(*setup, timeout_s=START_TIMEOUT_S)
+        await self._call(self._truth, self._host, timeout_s=START_TIMEOUT_S)
         self._clock.restart()  # not before: a clock without readings counts as unreadable
         for _ in range(_CLOCK_READINGS):
             await self._read_clock()
@@ -101,8 +101,8 @@ class RenderedCamera:
         return {
             "pixel_format": "Mono8",
             "region": [0, 0, self._truth.camera.width, self._truth.camera.height],
-            "exposure_us": self._exposure_us,
-            "gain_db": self._gain_db,
+            "exposure_us": self._truth.light.exposure_us,
+            "gain_db": self._truth.light.gain_db,
         }
 
     async def glimpse(self) -> Image:

@@ -12,6 +12,7 @@ import time
 from typing import BinaryIO
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +20,7 @@ from calibrate.geometry import Array, inverse
 from recordings.schema.messages import CameraModel, Image, Stamps
 from station.cell.errors import RobotError
 from station.simulation.launch import AdminClient
-from station.simulation.renderer import Light, render, scaled
+from station.simulation.renderer import render, scaled
 from station.simulation.truth import CellTruth
 
 TRIGGER_LATENCY_NS = 150_000
@@ -31,10 +32,9 @@ PREVIEW_SCALE = 0.5
 
 
 class CameraProcess:
-    def __init__(self, truth: CellTruth, controller_host: str, exposure_us: float, gain_db: float) -> None:
+    def __init__(self, truth: CellTruth, controller_host: str) -> None:
         self.truth = truth
-        self.exposure_us = exposure_us
-        self.gain_db = gain_db
+        self.light = truth.light
         self._host = controller_host
         self._admin: AdminClient | None = None
         self._placed: Array | None = None
@@ -72,22 +72,17 @@ class CameraProcess:
 
     def _frame(self, start_ns: int, camera: CameraModel, frame_id: int) -> Image:
         picture = self.picture(start_ns, camera)
-        arrival_ns = start_ns + round(self.exposure_us * 1000) + READOUT_NS
+        arrival_ns = start_ns + round(self.light.exposure_us * 1000) + READOUT_NS
         time.sleep(max(0.0, (arrival_ns - time.monotonic_ns()) / 1e9))
         stamps = Stamps(host_monotonic_ns=arrival_ns, device_ns=self.device_ns(start_ns))
-        return Image(picture, stamps, frame_id, 0, self.exposure_us, self.gain_db)
+        return Image(picture, stamps, frame_id, 0, self.light.exposure_us, self.light.gain_db)
 
     def picture(self, start_ns: int, camera: CameraModel) -> NDArray[np.uint8]:
         """Render an image exposed from host time `start_ns`; return after the end of exposure."""
-        middle_ns = start_ns + round(self.exposure_us * 500)
+        middle_ns = start_ns + round(self.light.exposure_us * 500)
         camera_from_board = self.camera_from_board(self._flange_at(middle_ns))
-        light = Light(
-            exposure_us=self.exposure_us,
-            gain_db=self.gain_db,
-            illumination=self.truth.illumination,
-            pixel_noise=self.truth.pixel_noise,
-            blur_px=self.truth.blur_px * camera.width / self.truth.camera.width,
-        )
+        blur_px = self.light.blur_px * camera.width / self.truth.camera.width
+        light = msgspec.structs.replace(self.light, blur_px=blur_px)
         return render(camera, self.truth.board, camera_from_board, light, self._rng)
 
     def camera_from_board(self, base_from_flange: Array) -> Array:

@@ -29,7 +29,7 @@ from station.cell.config import (
 )
 from station.cell.layout import guess_from
 from station.simulation.renderer import scaled
-from station.simulation.truth import CellTruth, NoiseLevel, SceneName
+from station.simulation.truth import CellTruth, Light, NoiseLevel, SceneName
 
 ROBOT = "UR10"
 _PRINTED_X = np.array(
@@ -178,8 +178,7 @@ def _with_noise(truth: CellTruth, level: _CellNoise, rng: np.random.Generator) -
         **tables,
         robot_sigma_m=level.robot_sigma_m * spread,
         robot_sigma_rad=level.robot_sigma_rad * spread,
-        pixel_noise=level.pixel_noise * spread,
-        blur_px=level.blur_px * spread,
+        light=Light(pixel_noise=level.pixel_noise * spread, blur_px=level.blur_px * spread),
         camera_clock_offset_ns=int(rng.integers(-(10**12), 10**12)),
     )
 

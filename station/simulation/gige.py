@@ -18,6 +18,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -154,7 +155,7 @@ def rendered_source(camera: CameraProcess) -> Source:
     last = [np.full((camera.truth.camera.height, camera.truth.camera.width), 20, np.uint8)]
 
     def source(width: int, height: int, exposure_us: float, gain_db: float) -> tuple[NDArray[np.uint8], int]:
-        camera.exposure_us, camera.gain_db = exposure_us, gain_db
+        camera.light = msgspec.structs.replace(camera.light, exposure_us=exposure_us, gain_db=gain_db)
         start_ns = time.monotonic_ns()
         try:
             last[0] = camera.picture(start_ns, camera.truth.camera)
@@ -171,7 +172,7 @@ def main(controller_host: str, truth: str, serial: str) -> None:
     `controller_host`: whose arm the camera looks at. `truth`: file of the simulated cell.
     """
     cell = read_truth(Path(truth))
-    rendered = CameraProcess(cell, controller_host, cell.exposure_us, cell.gain_db)
+    rendered = CameraProcess(cell, controller_host)
     rendered.warm_up()
     cv2.setNumThreads(1)
     model = cell.camera

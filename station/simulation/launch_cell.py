@@ -23,7 +23,7 @@ from station.devices.ur import UrRobot
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.camera import RenderedCamera
 from station.simulation.launch import start_controller
-from station.simulation.truth import CellTruth, write_truth
+from station.simulation.truth import CellTruth, Light, write_truth
 
 GIGE_PACKET_BYTES = 8996
 TRUTH = "truth.json"
@@ -171,9 +171,11 @@ def truth_within(config: StationConfig, seed: int) -> CellTruth:
         robot_sigma_m=REPEATABILITY_M,
         robot_sigma_rad=REPEATABILITY_RAD,
         # Choose the light for which the configured exposure and gain are right.
-        illumination=_NORMAL_EXPOSURE_US / camera.exposure_us * 10 ** (-camera.gain_db / 20),
-        exposure_us=camera.exposure_us,
-        gain_db=camera.gain_db,
+        light=Light(
+            camera.exposure_us,
+            camera.gain_db,
+            illumination=_NORMAL_EXPOSURE_US / camera.exposure_us * 10 ** (-camera.gain_db / 20),
+        ),
     )
 
 

@@ -18,6 +18,7 @@ from calibrate.boards.printing import draw_pattern, origin_mm
 from calibrate.geometry import Array
 from calibrate.projection import camera_matrix, project_pixels, undistort
 from recordings.schema.messages import BoardSpec, CameraModel
+from station.simulation.truth import Light as Light
 
 Floats = NDArray[np.float32]
 BLACK, WHITE = 0.05, 0.85
@@ -80,19 +81,6 @@ def board_print(board: BoardSpec) -> BoardPrint:
     x0, y0, x1, y1 = (1e-3 * edge for edge in sheet)
     metres = [(1e-3 * found).astype(np.float32) for found in (columns, rows, circles - [right, down, 0])]
     return BoardPrint((x0, y0, x1, y1), metres[0], metres[1], black, metres[2])
-
-
-@dataclass(frozen=True)
-class Light:
-    """Exposure, gain, illumination, noise and blur of an image."""
-
-    exposure_us: float = FULL_SCALE_US
-    gain_db: float = 0.0
-    illumination: float = 1.0
-    pixel_noise: float = 2.0
-    """Noise of a pixel, 1σ, grey levels, at 0 dB"""
-    blur_px: float = 0.7
-    """Sigma of the lens's blur"""
 
 
 @dataclass(frozen=True, eq=False)

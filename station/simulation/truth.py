@@ -21,6 +21,18 @@ SceneName = Literal["paper", "paper-binned"]
 NoiseLevel = Literal["low", "mid", "high"]
 
 
+class Light(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Exposure, gain, illumination, noise and blur of an image."""
+
+    exposure_us: float = 10_000.0
+    gain_db: float = 0.0
+    illumination: float = 1.0
+    pixel_noise: float = 2.0
+    """Noise of a pixel, 1σ, grey levels, at gain 0 dB."""
+    blur_px: float = 0.7
+    """Sigma of the lens's blur."""
+
+
 class CellTruth(ArmTruth, frozen=True, kw_only=True, omit_defaults=True):
     scene: str
     mount: Mount
@@ -32,13 +44,7 @@ class CellTruth(ArmTruth, frozen=True, kw_only=True, omit_defaults=True):
     """True X: flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand)."""
     board_place: Matrix4
     """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
-    pixel_noise: float = 2.0
-    """Noise of a pixel, 1σ, grey levels, at gain 0 dB."""
-    blur_px: float = 0.7
-    """Sigma of the lens's blur."""
-    illumination: float = 1.0
-    exposure_us: float = 10_000.0
-    gain_db: float = 0.0
+    light: Light = Light()
     camera_clock_offset_ns: int = 0
 
 

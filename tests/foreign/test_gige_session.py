@@ -123,7 +123,7 @@ def planned(config: StationConfig, poses: int) -> Plan:
 @pytest.fixture
 def seen(arm: SimulatedController) -> Iterator[Picture]:
     """What a camera on that arm sees now."""
-    renders = CameraProcess(TRUTH, arm.host, TRUTH.exposure_us, TRUTH.gain_db)
+    renders = CameraProcess(TRUTH, arm.host)
     renders.warm_up()
 
     def picture(number: int, width: int, height: int) -> NDArray[np.uint8]:

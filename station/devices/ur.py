@@ -67,15 +67,15 @@ class UrRobot(UrLink):
 
     def __init__(self, config: RobotConfig, log_dir: Path) -> None:
         super().__init__(config)
-        self.notice = ""
-        """Hint for people during a move that is no fault, such as a low speed slider; empty: none."""
         self.control_path: str = control_path(config)
         self.control_trouble = control_trouble(self.control_path)
         self._log_path = log_dir / "control.log"
         self._child: ControlChild | None = None
         self.control = False
         """True while the control program runs on the robot and takes moves from this station."""
-        self._moving = self._sent = False
+        self._moving = False
+        self._watch: MoveWatch | None = None
+        """The move under way, from when it is sent."""
         self._stop_reason = self._link_loss = ""
         self._ended_by: RobotError | None = None
         """Error that ended control between two moves."""
@@ -89,7 +89,12 @@ class UrRobot(UrLink):
 
     @property
     def in_motion(self) -> bool:
-        return self._sent or super().in_motion
+        return self._watch is not None or super().in_motion
+
+    @property
+    def notice(self) -> str:
+        """Hint for people during a move that is no fault, such as a low speed slider; empty: none."""
+        return self._watch.notice if self._watch is not None else ""
 
     async def start_control(self) -> None:
         """Start the control process, which loads its program; return when that took a first heartbeat.
@@ -182,7 +187,7 @@ class UrRobot(UrLink):
             await self._ready_to_move(child)
             sample = self.newest()
             watch = MoveWatch(sample.state.joints_rad, joints_rad, sample.operation, time.monotonic())
-            self._sent = True
+            self._watch = watch
             await self._follow(watch, child, child.move(joints_rad, speed_rad_s, acceleration_rad_s2))
         except BaseException as error:
             cause = self._known_cause(error) if isinstance(error, RobotError) else error
@@ -194,8 +199,7 @@ class UrRobot(UrLink):
                 cause = await cause_of_end(self, child, cause)
             raise cause from None
         finally:
-            self._moving = self._sent = False
-            self.notice, self._one_way_s = "", None
+            self._moving, self._watch, self._one_way_s = False, None, None
 
     async def _ready_to_move(self, child: ControlChild) -> None:
         """Wait until the state is current, the arm may move, and the control process heard a heartbeat."""
@@ -232,7 +236,6 @@ class UrRobot(UrLink):
             self._tool_looked_s = now_s
             self.check_tool(sample)
         child.check()
-        self.notice = watch.notice
         return False
 
     def _known_cause(self, error: RobotError) -> RobotError:

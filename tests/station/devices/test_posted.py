@@ -307,13 +307,13 @@ async def test_of_a_flood_little_is_read_and_nothing_kept(arm: PostedArm, line: 
     poster = await Poster.at(arm)
     await poster.rest(3)
     tracemalloc.start()
-    for _ in range(40):
+    for _ in range(20):
         poster.writer.write(line)
         await poster.writer.drain()  # waits in the program: the station reads at its own pace
     await until(lambda: trouble(arm) != "")
     most_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most_bytes < 1_000_000 < 40 * len(line)
+    assert most_bytes < 1_000_000 < 20 * len(line)
     poster.writer.transport.abort()
     await until(lambda: trouble(arm) == "post-nobody")
 

@@ -21,7 +21,7 @@ from station.operate.motion import prepared_motion
 from station.operate.stop_judge import WATCHED_S, judge
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.states import RUNNING
-from station.protocol.verbs import Prepare, Purpose, StopTest
+from station.protocol.verbs import Prepare, StopTest
 
 AFTER_S = WATCHED_S + 1.0
 """Time for which states are recorded after the move's end."""
@@ -116,7 +116,7 @@ class AcceptanceTest:
                 await self.recorder.begin()
             return approved
 
-        if not await prepared_motion(self.link, Prepare(Purpose.STOP_TEST, stop_test=test), approves):
+        if not await prepared_motion(self.link, Prepare(stop_test=test), approves):
             return None
         preview, move = offered[0], offered[0].stop_test
         assert move is not None

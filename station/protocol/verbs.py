@@ -149,7 +149,6 @@ class Purpose(StrEnum):
     RUN = "run"
     DRIFT_CHECK = "check"
     RESUME = "resume"
-    STOP_TEST = "stop-test"
 
 
 class Hello(Verb[Welcome], frozen=True):
@@ -236,7 +235,7 @@ class Prepare(Verb[MotionPreview], frozen=True):
     spoken = "a motion"
     purpose: Purpose = Purpose.RUN
     stop_test: StopTest | None = None
-    """The move of a stop test."""
+    """The move of a stop test; None: poses at which images are captured."""
 
 
 class Go(Verb[Done], frozen=True):

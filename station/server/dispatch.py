@@ -85,7 +85,7 @@ class SessionDispatcher:
             case verbs.LoadPlan():
                 session.load_plan(client, verb.plan)
             case verbs.MakePlan():
-                await session.make_plan(client, verb.poses, verb.seed, verb.lens_known, verb.aim)
+                await session.make_plan(client, verb)
             case verbs.Prepare():
                 if verb.stop_test is not None:
                     self._rule.by_person(await self._named(caller), "A stop test")

@@ -26,7 +26,7 @@ from station.cell.status import LeaseStatus, MotionPreview, StationState, Statio
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import fresh
 from station.devices.cell import Cell
-from station.plan.choose import CRITERIA, Aim
+from station.plan.choose import CRITERIA
 from station.plan.planner import make_plan
 from station.protocol import verbs
 from station.protocol.states import LATCHED, RUNNING
@@ -184,10 +184,7 @@ class Session:
     # -- from a question to a motion ---------------------------------------------------------------------
 
     async def prepare(
-        self,
-        client_id: int,
-        purpose: Purpose,
-        stop_test: verbs.StopTest | None = None,
+        self, client_id: int, purpose: Purpose = Purpose.RUN, stop_test: verbs.StopTest | None = None
     ) -> MotionPreview:
         """Check the whole path from where the arm is and offer it for approval, once."""
         context = self.context
@@ -195,8 +192,6 @@ class Session:
         await self._run_ended()  # its control process may still be ending
         self._void()
         voids = self.approvals.voids
-        if (purpose is Purpose.STOP_TEST) is (stop_test is None):
-            raise RefusedError("stop-test-named")
         if stop_test is not None:
             motion = await stop_motion(context, stop_test)
         else:
@@ -301,9 +296,7 @@ class Session:
         self._require_no_session()
         self._replace_plan(plan)
 
-    async def make_plan(
-        self, client_id: int, poses: int, seed: int, lens_known: bool = False, aim: Aim = "camera"
-    ) -> None:
+    async def make_plan(self, client_id: int, wanted: verbs.MakePlan) -> None:
         """Make a plan in the worker and load it. ConfigError and LimitError say what prevents it."""
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
@@ -311,15 +304,15 @@ class Session:
             start = (await fresh(self.context.cell.arm)).joints_rad
         except RobotError:
             start = None
-        self.store.event("planning", f"planning {poses} poses", poses=poses)
+        self.store.event("planning", f"planning {wanted.poses} poses", poses=wanted.poses)
         plan = await self.context.workers.call(
             make_plan,
             self.context.cell.config,
             start_joints_rad=start,
-            seed=seed,
-            count=poses,
-            lens_known=lens_known,
-            criterion=CRITERIA[aim],
+            seed=wanted.seed,
+            count=wanted.poses,
+            lens_known=wanted.lens_known,
+            criterion=CRITERIA[wanted.aim],
             timeout_s=PLAN_TIMEOUT_S,
         )
         self.load_plan(client_id, plan)

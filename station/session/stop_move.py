@@ -62,7 +62,7 @@ async def stop_motion(context: SessionContext, test: StopTest) -> Motion:
         plan.poses[0].joints_rad[test.joint],
         plan.joint_speed_rad_s,
     )
-    return Motion(Purpose.STOP_TEST, PoseQueue(plan), (0,), move)
+    return Motion(Purpose.RUN, PoseQueue(plan), (0,), move)
 
 
 def _free_move(context: SessionContext, test: StopTest, start: Vector6) -> Plan:

@@ -12,7 +12,6 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import msgspec
 
@@ -36,7 +35,7 @@ class Monitor:
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
-        self._files = _Files()
+        self._not_accepted = ""
         moved = context.cell.mover is not None
         self._geometry = cell_geometry(context.cell.config) if moved else None
 
@@ -48,7 +47,6 @@ class Monitor:
             robot=self._robot(),
             camera=self._camera(),
             trigger=self._trigger(),
-            recorder=RecorderStatus(self._files.free_bytes),
             pending=self._pending(),
         )
 
@@ -66,7 +64,7 @@ class Monitor:
             remote=mover.remote if mover else None,
             control=mover is not None and mover.control,
             control_path=mover.control_path if mover else "",
-            not_accepted=self._files.not_accepted,
+            not_accepted=self._not_accepted,
             speed_limit_m_s=min(context.cell.config.limits.speed_m_s, SPEED_CAP_M_S),
             by_hand=mover is None,
             notice=arm.notice,
@@ -99,23 +97,17 @@ class Monitor:
     async def watch_files(self) -> None:
         """Read files for the daemon's life, in a thread: a hanging disk must not delay the heartbeat."""
         while True:
-            self._files = await WATCH.run(_read_files, self._context)
+            free_bytes, self._not_accepted = await WATCH.run(_read_files, self._context)
+            self._context.store.update(recorder=RecorderStatus(free_bytes))
             await asyncio.sleep(DISK_PERIOD_S)
 
 
-@dataclass(frozen=True)
-class _Files:
-    """Facts of the disk: free space in steps of 1 MB (None where it is gone), and the acceptance."""
-
-    free_bytes: int | None = None
-    not_accepted: str = ""
-
-
-def _read_files(context: SessionContext) -> _Files:
+def _read_files(context: SessionContext) -> tuple[int | None, str]:
+    """Read free space in steps of 1 MB, None where it is gone, and why the arm is not accepted."""
     free_bytes = None
     with contextlib.suppress(OSError):
         free_bytes = shutil.disk_usage(context.root).free // 1_000_000 * 1_000_000
-    return _Files(free_bytes, context.cell.acceptance_trouble(context.root))
+    return free_bytes, context.cell.acceptance_trouble(context.root)
 
 
 TICK_S = 0.02

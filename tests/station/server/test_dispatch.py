@@ -194,7 +194,7 @@ async def test_a_program_cannot_approve_motion_of_a_real_arm_whatever_it_says(
             said = msgspec.json.encode(refused.value.data).decode()
             assert summary["token"] not in said and sha256[:12] not in said
         with raises("no-terminal"):
-            await program.request("prepare", purpose="stop-test", stop_test=STOP_TEST)
+            await program.request("prepare", stop_test=STOP_TEST)
     assert "move" not in served.rig.arm.log and "start control" not in served.rig.arm.log
     await served.control.close()
 
@@ -206,7 +206,7 @@ async def test_a_named_service_approves_by_the_hash_of_plan_and_cell_and_is_writ
     session = served.rig.session
     async with await served.client() as program:
         with raises("no-terminal"):
-            await program.request("prepare", purpose="stop-test", stop_test=STOP_TEST)
+            await program.request("prepare", stop_test=STOP_TEST)
         cell = session.context.cell.config
         slower = msgspec.structs.replace(cell, limits=msgspec.structs.replace(cell.limits, speed_m_s=0.1))
         sha256, of_another = (approval_sha256(small_plan, config) for config in (cell, slower))

@@ -17,7 +17,7 @@ from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
 from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus
 from station.cell.status import StationState as S
-from station.protocol.verbs import Purpose, Skip
+from station.protocol.verbs import MakePlan, Purpose, Skip
 from station.server.connections import ClientServer
 from station.server.dispatch import SessionDispatcher
 from station.session import device_connector, supervisor
@@ -212,7 +212,7 @@ async def test_an_open_session_keeps_its_plan(rig: Rig, small_plan: Plan) -> Non
     await rig.session.acknowledge("anna")
     assert rig.state is S.DISCONNECTED
     with raises("session-open"):
-        await rig.session.make_plan(1, POSES, 4)
+        await rig.session.make_plan(1, MakePlan(POSES))
     rig.arm.lost = False
 
 

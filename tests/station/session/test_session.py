@@ -174,19 +174,18 @@ async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_pl
     assert "move" not in rig.arm.log
 
 
-@pytest.mark.parametrize("purpose", [Purpose.RUN, Purpose.STOP_TEST])
+@pytest.mark.parametrize("test", [None, StopTest(StopWay.CONTROL, 0.05)])
 async def test_no_motion_is_offered_while_nobody_knows_where_the_camera_is(
-    rig: Rig, purpose: Purpose
+    rig: Rig, test: StopTest | None
 ) -> None:
     context = rig.session.context
     config = msgspec.structs.replace(context.cell.config, camera_guess=None)
     context.cell = replace(context.cell, config=config)
-    test = StopTest(StopWay.CONTROL, 0.05) if purpose is Purpose.STOP_TEST else None
     with raises("no-guess"):
-        await rig.session.prepare(1, purpose, test)
+        await rig.session.prepare(1, stop_test=test)
     assert rig.session.store.status.go is None
     context.cell = replace(context.cell, source="playback")  # no arm moves
-    await rig.session.prepare(1, purpose, test)
+    await rig.session.prepare(1, stop_test=test)
 
 
 async def test_nobody_approves_what_the_arm_will_refuse(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from tests.station.session_rig import NewRig, Rig
 
 async def offered(rig: Rig, speed_m_s: float = 0.05, joint: int = 0) -> MotionPreview:
     test = StopTest(StopWay.CONTROL, speed_m_s, joint)
-    return await rig.session.prepare(1, Purpose.STOP_TEST, stop_test=test)
+    return await rig.session.prepare(1, stop_test=test)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.02, 0.05, 0.25])

@@ -70,6 +70,8 @@ def plan_command(
             )
         if output is not None:
             save_plan(plan, output)
+    if config is None:
+        err.print("This is a plan of the SIMULATED cell. Name yours: --config FILE.", style="yellow")
     outcome = check_plan(plan, standing, cell_geometry(cell))
     if as_json:
         print_json(_summary(plan, cell, outcome))
@@ -96,7 +98,6 @@ def _simulated() -> tuple[StationConfig, list[float]]:
     # Simulation is loaded only where it is wanted.
     from station.simulation.cells import cell_config, make_cell
 
-    err.print("This is a plan of the SIMULATED cell. Name yours: --config FILE.", style="yellow")
     truth = make_cell("paper", 0, "low", "eye-in-hand")
     return cell_config(truth), list(truth.start_joints_rad)
 

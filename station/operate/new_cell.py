@@ -17,8 +17,9 @@ import yaml
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, transform_points
-from recordings.files import ASKED_FOR, write_atomically
+from recordings.files import ASKED_FOR, read_file, write_atomically
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
+from recordings.strict_yaml import LIMIT_BYTES
 from station.analysis.found_cell import FoundCell
 from station.cell.config import (
     CameraConfig,
@@ -219,7 +220,8 @@ def write_config(draft: Draft, path: Path) -> StationConfig:
     config = made_config(draft)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists():
-        path.with_name(path.name + ".before").write_bytes(path.read_bytes())
+        before = read_file(path, LIMIT_BYTES)
+        write_atomically(path.with_name(path.name + ".before"), before, ASKED_FOR)
     write_atomically(path, config_text(config).encode(), ASKED_FOR)
     written, _ = load_config(path)
     if not draft.posted:

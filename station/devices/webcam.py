@@ -63,6 +63,7 @@ class WebcamCamera:
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
         """Return a frame whose exposure began after this call; takes `LATENCY_S` longer than a frame."""
+        timeout_s += self._exposure_us() / 1e6
         try:
             return await self._run(partial(self._fresh, timeout_s), timeout_s)
         except CameraError:
@@ -73,22 +74,19 @@ class WebcamCamera:
         return await self._run(self._settings, _GLIMPSE_S)
 
     async def glimpse(self) -> Image:
-        return await self._run(partial(self._fresh, _GLIMPSE_S), _GLIMPSE_S)
+        return await self.capture(_GLIMPSE_S)
 
     async def close(self) -> None:
         await self._worker.close(self._release)
 
-    async def _run(self, job: Callable[[], T], timeout_s: float | None = None) -> T:
+    async def _run(self, job: Callable[[], T], timeout_s: float) -> T:
         """Run a job in the driver's thread; CameraError when it does not end in time."""
         running = self._worker.run(job)
-        done, _ = await asyncio.wait({running}, timeout=timeout_s and timeout_s + _PATIENCE_S)
+        done, _ = await asyncio.wait({running}, timeout=timeout_s + _PATIENCE_S)
         if not done:
             running.cancel()
-            raise self._late(timeout_s or 0.0)
+            raise CameraError("no-image", limit_s=timeout_s)
         return running.result()
-
-    def _late(self, timeout_s: float) -> CameraError:
-        return CameraError("no-image", limit_s=timeout_s)
 
     def _open(self) -> None:
         self._release()
@@ -158,7 +156,7 @@ class WebcamCamera:
             arrived_ns = self._grab(video)
             if arrived_ns - round(self._exposure_us() * 1000) - LATENCY_S * 1e9 >= asked_ns:
                 return self._image(video, arrived_ns)
-        raise self._late(timeout_s)
+        raise CameraError("no-image", limit_s=timeout_s)
 
     def _check(self, video: cv2.VideoCapture) -> None:
         now = _readable(video)

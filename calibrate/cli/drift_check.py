@@ -54,7 +54,7 @@ def drift_check(
         Path | None, typer.Option("--calibration", help="Instead of the installed one; nothing is noted")
     ] = None,
     root: Root = None,
-    camera: Annotated[str, typer.Option(help="Name of a folder's camera in the cell")] = MAIN_CAMERA,
+    camera: Annotated[str, typer.Option(help="Name of its camera, where it says none")] = MAIN_CAMERA,
     as_json: AsJson = False,
 ) -> None:
     """Test the installed calibration on new views.
@@ -72,7 +72,7 @@ def drift_check(
     """
     production = (source / DATASET_FILE).is_file()
     if not production and calibration_file is None:
-        camera = open_recording(source).info.camera_identity.name or MAIN_CAMERA
+        camera = open_recording(source).info.camera_identity.name or camera
     calibration, held = named_or_installed(calibration_file, root, camera)
     options = JobOptions(
         board=None if board is None else read_board(board), camera=calibration.intrinsics.model

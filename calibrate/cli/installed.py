@@ -107,6 +107,8 @@ def export(
         typer.echo(content.decode(), nl=False)
         return
     check_target(output, "export")
+    if any(output.exists() and output.samefile(source) for source in (*(driver_tf or []), arm) if source):
+        raise UsageError("target-exists", path=output, by="what is made of it")
     write_output(output, content)
 
 

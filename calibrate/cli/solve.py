@@ -113,12 +113,11 @@ def solve(
         check_target(report, "report")
         if os.path.realpath(report) == os.path.realpath(target):
             raise UsageError("target-exists", path=target, by="both calibration and report")
+        from calibrate.report.page import report_page  # slow to load, and not always there
     with bounded(Limits(time_limit_s, memory_limit_mib)), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)
     if report is not None:
-        from calibrate.report.page import report_page  # like matplotlib, slow to load
-
         write_output(report, report_page(job).encode())
     if as_json:
         print_json(solve_json(job))

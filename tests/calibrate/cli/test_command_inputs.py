@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -174,6 +175,25 @@ def test_what_an_arm_or_a_solve_was_needed_for_is_never_written_over(
     assert calibration.read_bytes() == real_file.read_bytes()
     assert (tmp_path / "pipe").is_fifo() and (tmp_path / "notes.txt").read_text() == "mine"
     assert not (tmp_path / "new.yaml").exists()
+
+
+def test_a_report_that_cannot_be_drawn_is_said_before_the_solve(
+    session_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("matplotlib", "calibrate.report.page", "calibrate.report.plots"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    refused(run("solve", session_file, "--report", "r.html", cwd=tmp_path), 2, "", "[report]")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_export_never_replaces_what_it_is_made_of(real_file: Path, tmp_path: Path) -> None:
+    urdf = "<robot name='r'><link name='a'/><link name='b'/><joint name='j' type='fixed'>"
+    urdf += "<parent link='a'/><child link='b'/></joint></robot>"
+    (tmp_path / "driver.urdf").write_text(urdf)
+    words = ("export", real_file, "--to", "urdf", "--driver-tf", "driver.urdf", "-o", "./driver.urdf")
+    refused(run(*words, cwd=tmp_path), 2, "target-exists", "driver.urdf")
+    assert (tmp_path / "driver.urdf").read_text() == urdf
 
 
 def test_a_file_of_another_kind_is_named_with_what_to_give(session_file: Path, tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def load_views(
             told=", ".join(map(str, sorted(unknown))),
             views=max((view.index + 1 for view in recorded), default=0),
         )
-    missing = [
+    by_hand = [
         RejectedView(view.index, view.name, "excluded (--without)", "by-hand")
         for view in recorded
         if view.index + 1 in without
@@ -84,9 +84,10 @@ def load_views(
     recorded = [view for view in recorded if view.index + 1 not in without]
     spec = board or info.board
     if spec.kind is BoardKind.UNSEEN:
-        return _told_views(recording, recorded, missing, fewest)
+        return _told_views(recording, recorded, by_hand, fewest)
     model = camera or info.camera
     views: list[BoardView] = []
+    missing: list[RejectedView] = []
     seen: dict[int, Detection] = {}
     for view, detection in detect_all(recording, recorded, spec, model, progress, threads):
         if isinstance(detection, BadImageError):
@@ -101,22 +102,27 @@ def load_views(
         joints = None if view.joints_rad is None else np.array(view.joints_rad)
         views.append(BoardView(view.index, view.name, flange, points, detection.pixels, joints))
     if len(views) < fewest:
-        raise _too_few(recording, spec, len(views), seen, missing, fewest)
+        raise _too_few(recording, spec, len(views), seen, [*missing, *by_hand], fewest)
     if not (model.width and model.height):
         first = next(iter(seen.values()))
         model = msgspec.structs.replace(model, width=first.width, height=first.height)
     found = ViewSet(info.mount, tuple(views), model, info.robot.model, _calibrated_arm(recording))
-    return LoadedViews(found, spec, tuple(missing), seen, recording.losses)
+    return LoadedViews(found, spec, (*missing, *by_hand), seen, recording.losses)
 
 
 def _told_views(
-    recording: Recording, views: list[View], missing: list[RejectedView], fewest: int
+    recording: Recording, views: list[View], by_hand: list[RejectedView], fewest: int
 ) -> LoadedViews:
     """Take the views of a recording without pictures, in which the board's poses were told."""
     info = recording.info
     told = [view for view in views if view.camera_from_board is not None]
     if len(told) < fewest:
-        raise _too_few(recording, info.board, len(told), {}, missing, fewest)
+        raise TooFewViewsError(
+            counted=f"{recording.path}: the board's pose is known in {len(told)} of {len(views)} views",
+            views=len(told),
+            needed=fewest,
+            advice="Give more pairs of poses.",
+        )
     poses = np.array([(view.base_from_flange, view.camera_from_board) for view in told], dtype=float)
     found = ViewSet.from_poses(info.mount, poses[:, 0], poses[:, 1])
     own = tuple(
@@ -129,7 +135,7 @@ def _told_views(
         for one, view in zip(found, told, strict=True)
     )
     found = replace(found, views=own, robot_model=info.robot.model, arm=_calibrated_arm(recording))
-    return LoadedViews(found, info.board, tuple(missing), losses=recording.losses)
+    return LoadedViews(found, info.board, tuple(by_hand), losses=recording.losses)
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:
@@ -219,7 +225,7 @@ def _too_few(
 ) -> TooFewViewsError:
     images = len(seen) + sum(view.kind == "unreadable-picture" for view in missing)
     causes = Counter(detection.cause for detection in seen.values())
-    often = max(1, len(missing) / 2)
+    often = max(1, sum(view.kind != "by-hand" for view in missing) / 2)
     if causes["squares-counted"] >= often:
         return TooFewViewsError(
             "squares-counted",
@@ -234,7 +240,7 @@ def _too_few(
         return TooFewViewsError("mirrored", path=recording.path, mirrored=causes["mirrored"], images=images)
     counted = f"{recording.path}: the board is seen in {found} of {images} images"
     advice = "Check the board's kind, columns and rows; solve again with --board to try another."
-    if images == 0:
+    if images == 0 and not missing:
         counted = f"{recording.path}: no image has a robot pose"
         advice = "Images of a sweep have none: record poses with `station capture`."
     elif missing:

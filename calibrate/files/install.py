@@ -168,7 +168,7 @@ def rollback(
         target = before_current(known, read_log(root, camera)) if to is None else numbered
         if target is None and to is None:
             withdrawn = validity_of(folder, current_version(folder)[0]).state is ValidityState.WITHDRAWN
-            withdraw_it = f"To take it out of use: {_withdraw_line(root, camera)}"
+            withdraw_it = f"To take it out of use: {_line(root, camera, 'withdraw', 'REASON')}"
             advice = f"{WITHDRAWN_REMEDY}." if withdrawn else withdraw_it
             raise InstallError("nothing-older", folder=folder, advice=advice)
         if target is None:
@@ -191,18 +191,14 @@ def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Va
 
 def undo_line(root: Path | None = None, camera: str = MAIN_CAMERA) -> str:
     """Make the command that undoes the last installation: a rollback, or withdrawal where there is none."""
-    if before_current(installed_versions(root, camera), read_log(root, camera)) is None:
-        return _withdraw_line(root, camera)
-    return shlex.join(["calibrate", "rollback", *_where(root, camera)])
+    older = before_current(installed_versions(root, camera), read_log(root, camera))
+    return _line(root, camera, *(["rollback"] if older else ["withdraw", "REASON"]))
 
 
-def _withdraw_line(root: Path | None, camera: str) -> str:
-    return shlex.join(["calibrate", "withdraw", "REASON", *_where(root, camera)])
-
-
-def _where(root: Path | None, camera: str) -> list[str]:
+def _line(root: Path | None, camera: str, *words: str) -> str:
+    where = [] if root is None else ["--root", str(root)]
     named = [] if camera == MAIN_CAMERA else ["--camera", camera]
-    return [*([] if root is None else ["--root", str(root)]), *named]
+    return shlex.join(["calibrate", *words, *where, *named])
 
 
 def _validity_again(target: InstalledVersion, max_age_days: float | None) -> Validity:

@@ -115,7 +115,7 @@ def _picture(job: SolvedRecording) -> str:
     return html.figure(
         picture,
         "Blue: the board where this calibration and the robot's pose place it. That is at most "
-        f"{off_px:.2f} px beside the board in the image, here in pose {view.index + 1}.",
+        f"{off_px:.2f} px (rms) beside the board in the image, here in pose {view.index + 1}.",
     )
 
 

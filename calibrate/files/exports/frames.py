@@ -110,9 +110,12 @@ class FrameNames:
         return np.asarray(self.fixed.track(parent, child).at(last_ns)[0])
 
 
-def comment(calibration: Calibration, frames: FrameNames, corrected: bool = False) -> str:
+def comment(
+    calibration: Calibration, frames: FrameNames, corrected: bool = False, attachable: bool = False
+) -> str:
     """Make the comment on the origin of an export, with a warning for a calibration of no real cell.
 
+    attachable: also how these frames and those of a camera's driver become one tree.
     Always one line: a line break in a name must not become a line of a launch file or a script.
     """
     stamp = SOURCE_STAMPS[calibration.source]
@@ -121,14 +124,10 @@ def comment(calibration: Calibration, frames: FrameNames, corrected: bool = Fals
     two = ("the corrected arm", "the arm as it is")[:: 1 if corrected else -1]
     offered = calibration.arm_table is not None and calibration.arm_table.offered
     arm = f"Camera pose for {two[0]}, not for {two[1]}" if offered else ""
-    return " ".join(". ".join(filter(None, (stamp, origin, arm, held))).split())
+    tree = "To place a camera driver's own frames: options attach and driver-tf of calibrate export"
+    how = tree if attachable and not frames.attach else ""
+    return " ".join(". ".join(part.rstrip(".") for part in (stamp, origin, arm, held, how) if part).split())
 
 
 def commented_yaml(calibration: Calibration, frames: FrameNames, plain: dict[str, Any], **layout: Any) -> str:
     return f"# {comment(calibration, frames)}\n{yaml.safe_dump(plain, sort_keys=False, **layout)}"
-
-
-def how_to_attach(frames: FrameNames) -> str:
-    """Say in a comment how these frames and those of a camera's driver become one tree."""
-    how = " To place a camera driver's own frames: options attach and driver-tf of calibrate export."
-    return "" if frames.attach else how

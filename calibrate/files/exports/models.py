@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration, CorrectedArm
-from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment, how_to_attach
+from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment
 from calibrate.files.integrity import content_sha256
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
 from calibrate.kinematics import URDF_LINKS, URDF_ORIGIN, DhTable, link_frames
@@ -23,7 +23,7 @@ def urdf(calibration: Calibration, frames: FrameNames) -> str:
     parent = frames.parent(calibration)
     name = quoteattr(f"{frames.node}_calibrated")
     return (
-        f"{commented(comment(calibration, frames) + how_to_attach(frames))}"
+        f"{commented(comment(calibration, frames, attachable=True))}"
         f"<robot name={name}>\n<link name={quoteattr(parent)}/>\n"
         f"{camera(frames.place(calibration, calibration.transform.matrix), parent, frames)}</robot>\n"
     )

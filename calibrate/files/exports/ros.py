@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.exports.frames import FrameNames, comment, commented_yaml, how_to_attach
+from calibrate.files.exports.frames import FrameNames, comment, commented_yaml
 from calibrate.geometry import Array, quaternion_from_matrix
 from calibrate.projection import camera_matrix, distortion
 
@@ -45,7 +45,7 @@ def _publisher_arguments(calibration: Calibration, frames: FrameNames) -> list[s
 
 def ros_launch(calibration: Calibration, frames: FrameNames) -> str:
     listed = ",\n".join(f"                {part!r}" for part in _publisher_arguments(calibration, frames))
-    return f'''# {comment(calibration, frames)}{how_to_attach(frames)}
+    return f'''# {comment(calibration, frames, attachable=True)}
 from launch import LaunchDescription
 from launch_ros.actions import Node
 

@@ -287,10 +287,6 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(small_session_file: Path
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
     for option in ("--time-offset=a.yaml", "--accept-move"):
         refused(run("solve", recordings[0], option, cwd=tmp_path), 2, "", option.partition("=")[0])
-    alone = run("solve", recordings[0], "-o", "alone.yaml", cwd=tmp_path)
-    assert alone.returncode in (0, 4)
-    pooled = read_calibration(tmp_path / "out" / rows[0]["calibration"])
-    assert pooled.result == read_calibration(tmp_path / "alone.yaml").result
 
 
 def test_the_report_is_one_page_with_no_network(small_session_file: Path, tmp_path: Path) -> None:

@@ -185,7 +185,10 @@ class TcpCheck:
         if length_m > LONGEST_M:
             raise RobotError("tcp-too-far", model=model.name, distance_m=length_m, limit_m=LONGEST_M)
         if self._stated is not None:
-            self.agree(self._stated)
+            _compare(
+                self._first, _pose(self._stated), _widened(self._tolerance, first), "tcp-mismatch", model.name
+            )
+            self._first = _pose(self._stated)
 
     def _try_controllers_model(self, model: RobotModel, first: RobotState) -> None:
         """Use the controller's own kinematics if they explain its tool pose.
@@ -197,7 +200,7 @@ class TcpCheck:
         ours, theirs = (forward(m, first.joints_rad) for m in (self._model, model))
         _compare(theirs, ours, FACTORY_LIMIT, "other-kinematics", self._model.name)
         own = _flange_from_tcp(model, first)
-        if _exceeds(difference(own, _pose(self._stated)), CALIBRATED_TOLERANCE):
+        if _exceeds(difference(own, _pose(self._stated)), _widened(CALIBRATED_TOLERANCE, first)):
             log.warning("the kinematics stated by the controller do not explain its tool pose; using ours")
             return
         self._model, self._tolerance = model, CALIBRATED_TOLERANCE
@@ -220,7 +223,7 @@ class TcpCheck:
         return pose_vector(self._first)
 
     def agree(self, stated: Vector6) -> None:
-        """Raise RobotError unless the stated offset explains the controller's tool pose."""
+        """Raise RobotError unless the offset that the control program reads is the one taken at connect."""
         _compare(self._first, _pose(stated), self._tolerance, "tcp-mismatch", self._model.name)
 
     def check(self, state: RobotState, installation: Installation) -> None:
@@ -235,10 +238,7 @@ class TcpCheck:
                 tolerance, code = LATE_TOLERANCE, "tcp-late"
             _compare(_pose(offset), _pose(self.offset), tolerance, code, self._model.name)
         now = _flange_from_tcp(self._model, state)
-        turned_rad = SKEW_S * sum(map(abs, state.joint_speeds_rad_s))
-        reach_m = float(np.linalg.norm(state.tcp_pose[:3])) + LONGEST_M
-        tolerance = (self._tolerance[0] + turned_rad * reach_m, self._tolerance[1] + turned_rad)
-        _compare(now, self._first, tolerance, "tcp-changed", self._model.name)
+        _compare(now, self._first, _widened(self._tolerance, state), "tcp-changed", self._model.name)
 
 
 def check_payload(now: Payload, first: Payload) -> None:
@@ -252,6 +252,13 @@ def check_payload(now: Payload, first: Payload) -> None:
 
 def _flange_from_tcp(model: RobotModel, state: RobotState) -> Array:
     return inverse(forward(model, state.joints_rad)) @ _pose(state.tcp_pose)
+
+
+def _widened(tolerance: tuple[float, float], state: RobotState) -> tuple[float, float]:
+    """Add what joints and tool pose of one sample can be apart while the arm moves."""
+    turned_rad = SKEW_S * sum(map(abs, state.joint_speeds_rad_s))
+    reach_m = float(np.linalg.norm(state.tcp_pose[:3])) + LONGEST_M
+    return tolerance[0] + turned_rad * reach_m, tolerance[1] + turned_rad
 
 
 def _pose(vector: Vector6) -> Array:

@@ -115,6 +115,17 @@ def test_in_motion_joints_and_pose_of_neighbouring_cycles_are_no_change_but_anot
         check.check(msgspec.structs.replace(moved, joint_speeds_rad_s=speeds), Installation())
 
 
+def test_an_arm_that_another_program_moves_at_connect_is_no_mix_up_and_keeps_its_calibration() -> None:
+    speeds: Vector6 = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    ahead: Vector6 = (HERE[0] + 0.008, *HERE[1:])
+    late = msgspec.structs.replace(sample(FACTORY, HERE, TOOL), joints_rad=ahead, joint_speeds_rad_s=speeds)
+    check = TcpCheck(UR10, False, late, stated(FACTORY, TOOL))
+    assert check.kinematics is not None and check.kinematics.a_m == FACTORY.a_m
+    check.check(sample(FACTORY, THERE, TOOL), stated(FACTORY, TOOL))
+    with raises("tcp-changed"):
+        check.check(sample(FACTORY, THERE, (TOOL[0] + 0.001, *TOOL[1:])), stated(FACTORY, TOOL))
+
+
 def test_a_changed_statement_is_noticed_before_the_arm_shows_it() -> None:
     check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), stated(UR10, TOOL))
     with raises("tcp-changed"):

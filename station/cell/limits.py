@@ -136,7 +136,7 @@ def check_path(
     gaps, contacts = margins(geometry, samples)
     problems += _margin_problems(leaving(gaps - SPACING_M / 2), contacts, name)
     speed, acceleration, duration, peak = allowed_speed(geometry, samples)
-    if speed < SLOWEST_RAD_S or acceleration < SLOWEST_RAD_S2:
+    if not (speed >= SLOWEST_RAD_S and acceleration >= SLOWEST_RAD_S2):
         text = (
             f"its joints would go {speed:.2g} rad/s, at {acceleration:.2g} rad/s² (at least "
             f"{SLOWEST_RAD_S:g} rad/s, {SLOWEST_RAD_S2:g} rad/s²). Raise the speed limits"
@@ -227,7 +227,7 @@ def _margin_problems(gaps: Array, contacts: Sequence[Contact], name: str) -> lis
         ]  # a plate consists of several capsules
         gap = gaps[:, alike].min(axis=1)
         at = int(np.argmin(gap))
-        if gap[at] < 0:
+        if not gap[at] >= 0:  # nor is what could not be computed free
             where = (
                 "at the target" if at == len(gaps) - 1 else f"after {at / (len(gaps) - 1):.0%} of the path"
             )

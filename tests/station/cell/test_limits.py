@@ -79,6 +79,14 @@ def test_an_obstacle_between_two_good_poses_is_found():
     assert "wrist 3 against the post" in {problem.of for problem in problems}
 
 
+def test_what_is_no_number_is_not_free():
+    lost = Capsule("post", (np.nan, 0.0, 0.0), (0.0, 0.0, 0.1), 0.01)
+    problems = check_path(
+        CellGeometry(MODELS["UR10"], LimitsConfig(), obstacles=(lost,)), REST, REST + 0.1
+    ).problems
+    assert {problem.limit for problem in problems} == {"clearance"}
+
+
 def test_a_plate_of_several_rods_is_one_problem():
     """A board on the flange, driven into the table."""
     board = plate("board", np.eye(4), np.array([-0.1, -0.1]), np.array([0.1, 0.1]))

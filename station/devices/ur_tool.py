@@ -28,6 +28,7 @@ from recordings.schema.messages import ArmKinematics, RobotState, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError
 from station.cell.layout import pose_vector
+from station.cell.stillness import RESTING_RAD_S
 from station.devices.ur_state import Payload
 
 log = logging.getLogger(__name__)
@@ -180,6 +181,8 @@ class TcpCheck:
             theta, a, d, alpha = installation.dh
             stated = replace(model, theta_rad=theta, a_m=a, d_m=d, alpha_rad=alpha)
             self._try_controllers_model(stated, first)
+        if self._stated is None and max(map(abs, first.joint_speeds_rad_s)) > RESTING_RAD_S:
+            raise RobotError("tcp-moving")  # derived in motion, it would be millimetres off
         self._first = _flange_from_tcp(self._model, first)
         length_m = float(np.linalg.norm(self._first[:3, 3]))
         if length_m > LONGEST_M:

@@ -119,6 +119,8 @@ def test_an_arm_that_another_program_moves_at_connect_is_no_mix_up_and_keeps_its
     speeds: Vector6 = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     ahead: Vector6 = (HERE[0] + 0.008, *HERE[1:])
     late = msgspec.structs.replace(sample(FACTORY, HERE, TOOL), joints_rad=ahead, joint_speeds_rad_s=speeds)
+    with raises("tcp-moving"):
+        TcpCheck(UR10, False, late, Installation())
     check = TcpCheck(UR10, False, late, stated(FACTORY, TOOL))
     assert check.kinematics is not None and check.kinematics.a_m == FACTORY.a_m
     check.check(sample(FACTORY, THERE, TOOL), stated(FACTORY, TOOL))

@@ -246,12 +246,6 @@ async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tm
     await replacement.close()
 
 
-async def test_without_a_daemon_the_remedy_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DaemonGoneError) as gone:
-        await Client(tmp_path / "none.sock").open()
-    assert "station serve" in gone.value.remedy
-
-
 async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None:
     control, path = server
     client = await Client(path).open()

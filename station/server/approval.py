@@ -34,12 +34,12 @@ def process(pid: int) -> Process | None:
         place = Path(f"/proc/{pid}")
         user = place.stat().st_uid
         # proc(5), after the name: state, ppid, pgrp, session, tty_nr, tpgid, …, starttime
-        fields = (place / "stat").read_text().rpartition(")")[2].split()
-    except OSError:
+        words = (place / "stat").read_text().rpartition(")")[2].split()
+        parent, group, terminal, foreground, began = (int(words[i]) for i in (1, 2, 4, 5, 19))
+    except (OSError, IndexError):  # STOP never waits for a name
         return None
-    group, terminal, foreground = int(fields[2]), int(fields[4]), int(fields[5])
     shown = terminal != 0 and group == foreground
-    return Process(user, int(fields[19]), _terminal_name(terminal) if shown else "", int(fields[1]))
+    return Process(user, began, _terminal_name(terminal) if shown else "", parent)
 
 
 def _terminal_name(number: int) -> str:

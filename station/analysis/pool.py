@@ -68,6 +68,9 @@ class Workers:
         try:
             async with asyncio.timeout(timeout_s):
                 return await asyncio.wrap_future(pool.submit(work))
+        except asyncio.CancelledError:  # its work would go on, and count as time of the next call
+            self._discard(pool)
+            raise
         except (BrokenProcessPool, TimeoutError) as error:
             self._discard(pool)
             code = "worker-late" if isinstance(error, TimeoutError) else "worker-died"

@@ -57,6 +57,7 @@ class FreedriveCapture:
             except Exception as error:  # capture by hand goes on without it
                 if told != (told := repr(error)):
                     log.exception("the guidance failed")
+                    store.problem(error, said=f"the guidance failed: {error!r}")
 
     async def _look(self) -> None:
         context, store, config = self._context, self._context.store, self._context.cell.config

@@ -197,6 +197,10 @@ async def test_a_call_that_hangs_costs_its_own_answer_only_and_nobody_waits_for_
     assert results[0] is None and results[2] is None and not waited
     assert isinstance(results[1], WorkerError) and results[1].code == "worker-late"
     ended.set()
+    given_up = asyncio.ensure_future(workers.call(time.sleep, PATIENCE_S))
+    await asyncio.sleep(0.05)
+    given_up.cancel()
+    assert await workers.call(time.sleep, 0.0, timeout_s=0.5) is None, "nobody waits for what nobody wants"
     # At the station's end a call that waits starts no worker.
     calls = [asyncio.ensure_future(workers.call(time.sleep, s)) for s in (PATIENCE_S, 0.0)]
     await asyncio.sleep(0.05)

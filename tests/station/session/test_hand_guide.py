@@ -103,7 +103,7 @@ async def test_a_defect_in_the_guidance_costs_one_look(guided: Rig, monkeypatch:
 
     monkeypatch.setattr(HandGuide, "look", broken)
     await until(lambda: captured(guided) == 1)
-    assert not defects
+    assert not defects and guided.told("internal")
 
 
 @pytest.mark.parametrize("counts", [True, False])

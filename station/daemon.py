@@ -89,7 +89,7 @@ class Daemon:
             freeze_startup()
             notify("READY=1")
             ready()
-            telling = asyncio.create_task(self._tell())
+            telling = asyncio.create_task(self.session.kept_going(self._tell))
             await self._ending.wait()
             telling.cancel()
         finally:
@@ -118,13 +118,13 @@ class Daemon:
     async def _tell(self) -> None:
         """Send changes of the status to watchers, gathered for a moment."""
         while True:
-            self._served_s = time.monotonic()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CONTROL_SERVED_S / 4):
                     await self._changed.wait()
             self._changed.clear()
             self._client_server.publish(self.session.store.status)
             self._tell_systemd()
+            self._served_s = time.monotonic()
             await asyncio.sleep(GATHER_S)
 
     def _ping(self) -> None:

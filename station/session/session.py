@@ -93,9 +93,9 @@ class Session:
             self._replace_plan(self.context.cell.plan)
         watching = self.supervisor.run, self.supervisor.monitor.watch_files
         loops = (*watching, self.devices.run, self._estimator.run, self.freedrive.run)
-        self._tasks = [asyncio.create_task(self._kept_going(loop)) for loop in loops]
+        self._tasks = [asyncio.create_task(self.kept_going(loop)) for loop in loops]
 
-    async def _kept_going(self, loop: Callable[[], Awaitable[object]]) -> None:
+    async def kept_going(self, loop: Callable[[], Awaitable[object]]) -> None:
         """Run a task of the daemon's life; a defect in it ends in fault, then it begins again."""
         while True:
             try:

@@ -8,17 +8,21 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from itertools import chain, repeat
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
 
 from station.cell.pose_plan import Plan
+from station.cell.status import StationState
 from station.daemon import Daemon
 from station.devices.cell import Cell
 from station.protocol.client import Client
+from tests.patience import until
 from tests.station.session_rig import ArmInMemory, CameraInMemory, WorkerInThisProcess, memory_config
 
 
@@ -43,6 +47,18 @@ async def test_what_was_loaded_is_not_searched_for_garbage_beside_a_moving_arm(d
 
     await daemon.run(ready)
     assert left[0] < 5000
+
+
+async def test_a_defect_in_what_tells_the_screens_is_a_fault_and_they_are_told(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("station.session.session.BEGIN_AGAIN_S", 0.01)
+    publish = Mock(side_effect=chain([ZeroDivisionError("a defect")], repeat(None)))
+    monkeypatch.setattr(daemon._client_server, "publish", publish)
+    running = asyncio.create_task(daemon.run())
+    await until(lambda: any(told.args[0].state is StationState.FAULT for told in publish.call_args_list))
+    daemon.end()
+    await running
 
 
 _TOUCHED: list[str] = []

@@ -52,14 +52,11 @@ def test_a_ringing_that_fits_one_gap_shows_in_the_other() -> None:
     assert image_motion([seen(0.0), seen(3.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
 
 
-@pytest.mark.parametrize("kind", ["colour", "16 bit"])
-def test_every_kind_of_picture_is_understood(kind: str) -> None:
+def test_every_kind_of_picture_is_understood() -> None:
     pair = [seen(0.0), seen(5.0)]
-    if kind == "colour":
-        pair = [cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) for picture in pair]
-    else:
-        pair = [picture.astype(np.uint16) << 8 for picture in pair]
-    assert image_motion(pair) == pytest.approx(5.0, abs=0.15)
+    colour = [cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) for picture in pair]
+    for images in (colour, [picture.astype(np.uint16) << 8 for picture in pair]):
+        assert image_motion(images) == pytest.approx(5.0, abs=0.15)
 
 
 def test_a_flat_picture_says_nothing() -> None:

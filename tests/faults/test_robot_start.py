@@ -46,14 +46,6 @@ def is_well(robot: UrRobot) -> bool:
     return False
 
 
-async def test_a_move_right_after_the_start_is_taken(cell: MakeCell) -> None:
-    c = await cell(control=False)
-    for _ in range(2):
-        await c.begin()
-        await c.arrives(c.near())
-        await c.robot.end_control()
-
-
 async def test_a_move_is_not_judged_by_news_from_before_the_start(
     cell: MakeCell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,8 +54,10 @@ async def test_a_move_is_not_judged_by_news_from_before_the_start(
     take, loop = StateReader._take, asyncio.get_running_loop()
     monkeypatch.setattr(StateReader, "_take", lambda *state: loop.call_later(0.08, take, *state))
     await asyncio.sleep(0.2)
-    await c.begin()
-    await c.arrives(c.near())
+    for _ in range(2):
+        await c.begin()
+        await c.arrives(c.near())
+        await c.robot.end_control()
 
 
 async def test_a_move_waits_for_a_session_that_was_busy_for_a_moment(cell: MakeCell) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
 import msgspec
 import pytest
@@ -45,15 +46,6 @@ class FakeLink:
             yield status
 
 
-class Person:
-    def __init__(self, yes: bool = True) -> None:
-        self.yes, self.shown = yes, PREVIEW
-
-    async def approves(self, preview: MotionPreview) -> bool:
-        self.shown = preview
-        return self.yes
-
-
 def loaded(*attempts: int) -> StationStatus:
     poses = tuple(PoseStatus(i, f"p{i}", attempt=attempt) for i, attempt in enumerate(attempts))
     return StationStatus(session=SessionStatus(poses=poses))
@@ -68,22 +60,22 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_a_plan_that_was_never_run_is_named_before_it_is_replaced(
     attempts: tuple[int, ...], named: bool
 ) -> None:
-    link, person = FakeLink(), Person()
-    assert await start_drift_check(link, loaded(*attempts), person.approves)
-    assert bool(person.shown.warnings) is named
+    link, approves = FakeLink(), AsyncMock(return_value=True)
+    assert await start_drift_check(link, loaded(*attempts), approves)
+    assert bool(approves.await_args.args[0].warnings) is named
     assert link.asked[-1] == verbs.Go("t", PREVIEW.approval_sha256)
 
 
 @pytest.mark.parametrize("refused", [None, verbs.Prepare, verbs.Go])
 async def test_it_is_loaded_again_where_nothing_was_started(refused: type[verbs.Verb[Any]] | None) -> None:
-    link, person = FakeLink(), Person(yes=refused is not None)
+    link, approves = FakeLink(), AsyncMock(return_value=refused is not None)
     link.refuse = refused
     if refused is None:
-        assert not await start_drift_check(link, loaded(0), person.approves)
+        assert not await start_drift_check(link, loaded(0), approves)
         assert verbs.Go not in map(type, link.asked)
     else:
         with pytest.raises(RefusedError):
-            await start_drift_check(link, loaded(0), person.approves)
+            await start_drift_check(link, loaded(0), approves)
     assert link.asked[-1] == verbs.LoadPlan(LOADED)
 
 
@@ -107,5 +99,5 @@ async def test_another_session_ends_it_without_a_recording() -> None:
 async def test_an_arm_that_a_person_moves_is_guided() -> None:
     link, status = FakeLink(), loaded()
     by_hand = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, by_hand=True))
-    assert await start_drift_check(link, by_hand, Person().approves)
+    assert await start_drift_check(link, by_hand, AsyncMock())
     assert link.asked == [verbs.Freedrive(True, check=True)]

@@ -53,8 +53,8 @@ END_RUN_AT_CLOSE_S, CLOSE_DEVICES_S = 1.0, 1.8
 STOP_WAIT_S = 1.0
 """Longest time that the answer to STOP, sent after the arm was stopped, waits for data being written."""
 PLAN_TIMEOUT_S = 180.0
-BEGIN_AGAIN_S = 1.0
-"""Pause after a defect in a task of the daemon: within it nothing may move, as no heartbeat is sent."""
+BEGIN_AGAIN_S = 0.2
+"""Pause after a defect in a task of the daemon, so that one that stays does not fill log and loop."""
 
 
 class Session:
@@ -105,7 +105,8 @@ class Session:
                 log.exception("a task of the daemon failed")
                 defect = StationError("internal", error=repr(error))
                 if self.store.state not in LATCHED:
-                    await self._halt(StationState.FAULT, defect.text, defect.code)
+                    with contextlib.suppress(Exception):  # the heartbeat must go on, whatever else fails
+                        await self._halt(StationState.FAULT, defect.text, defect.code)
                 await asyncio.sleep(BEGIN_AGAIN_S)
 
     async def close(self) -> None:

@@ -59,13 +59,13 @@ def own_file(real_file: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def make_file(solved_real: SolvedRecording, tmp_path: Path):
-    """make_file(shift_m, **changes) → path of a calibration file like the real one."""
+    """make_file(shift_m, **changes) → path of a file like the real one, without its long posterior."""
     count = 0
 
     def make(shift_m: float = 0.0, **changes: object) -> Path:
         nonlocal count
         count += 1
-        moved = shifted(solved_real.calibration, shift_m)
+        moved = msgspec.structs.replace(shifted(solved_real.calibration, shift_m), posterior=None)
         if changes.get("mount") == "eye-to-hand":
             changes["result"] = msgspec.structs.replace(moved.result, parent_frame="base")
         path = tmp_path / f"made-{count}.yaml"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,8 +97,8 @@ class Production:
 
 
 @pytest.fixture
-def root(make_file: Callable[..., Path], tmp_path: Path) -> Path:
-    install(make_file(), tmp_path / "s")
+def root(real_file: Path, tmp_path: Path) -> Path:
+    install(real_file, tmp_path / "s")
     return tmp_path / "s"
 
 

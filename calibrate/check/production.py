@@ -23,7 +23,7 @@ from calibrate.handeye.mixture import GAIN, class_chances, expected
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.uncertainty import inverse_of
-from calibrate.views import ViewSet
+from calibrate.views import ViewSet, require_no_copies
 
 EARLIER, MOST_EARLIER = 60, 300
 """Fewest and most earlier pictures."""
@@ -130,7 +130,12 @@ class EarlierPictures:
 
 
 def check_production(views: ViewSet, known: KnownCell) -> DriftCheck:
-    """Test the newest of all pictures, oldest first, against those before. Raises as `EarlierPictures.of`."""
+    """Test the newest of all pictures, oldest first, against those before.
+
+    Each is of a stop of its own: those of one stop share its error of the robot. Raises as
+    `EarlierPictures.of`, and BadViewsError for a picture that is there twice.
+    """
+    require_no_copies(views)
     known, newest = known.beside(views), min(NEWEST[-1], max(NEWEST[0], len(views) - EARLIER))
     earlier = replace(views, views=views.views[:-newest][-MOST_EARLIER:])
     return EarlierPictures.of(earlier, known).test(replace(views, views=views.views[-newest:]))

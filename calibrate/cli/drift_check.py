@@ -64,9 +64,9 @@ def drift_check(
     more of one board is reported. `station drift-check` captures the views.
 
     A folder with dataset.yaml and poses.csv holds production pictures: one tag or small board (--board) that
-    is fixed in the cell (eye-to-hand: on the gripper) and shows up in pictures that are taken anyway, while
-    the arm stands. The newest 3 to 30 are tested against the 60 to 300 before them; of a larger folder only
-    the newest 1,000 pictures are looked at.
+    is fixed in the cell (eye-to-hand: on the gripper) and shows up in pictures that are taken anyway, one of
+    each stop of the arm: those of one stop share its error, and would be an alarm. The newest 3 to 30 are
+    tested against the 60 to 300 before them; of a larger folder only the newest 1,000 pictures are looked at.
 
     Exit codes: 0 PASS, 4 FAIL, 1 views or files unusable (the calibration's source, say), 2 wrong options.
     """

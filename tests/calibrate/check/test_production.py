@@ -13,7 +13,7 @@ import yaml
 
 from calibrate.check.production import EARLIER, NEWEST, EarlierPictures, check_production
 from calibrate.cli import main
-from calibrate.errors import TooFewViewsError
+from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.files.install import install
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState
@@ -59,6 +59,9 @@ def test_a_shift_is_noticed_within_ten_pictures_and_nothing_else(cell: ArmCell) 
     assert not found.passed and found.shift_mm == pytest.approx(1.5, abs=0.4)
     blurred = [replace(v, pixels=v.pixels + np.array([2.0, -1.0]) * (i == 1)) for i, v in enumerate(after)]
     assert earlier.test(replace(after, views=tuple(blurred[:3]))).passed  # one of three is no move
+    stuck = replace(before, views=(*before.views, *(after.views[0],) * 3))
+    with raises("view-twice", BadViewsError):
+        check_production(stuck, known)
     for count in (EARLIER - 1, EARLIER, EARLIER + NEWEST[0] - 1):
         with raises("too-few-views", TooFewViewsError, needed=EARLIER + NEWEST[0]):
             check_production(replace(before, views=(*before.views, *after.views)[:count]), known)

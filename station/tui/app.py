@@ -148,11 +148,11 @@ class StationApp(LivePageApp[None], DaemonApp):
             self.result_path = ""  # another session begins: what was looked at is no part of it
         elif status.guidance.outline and before is not None and _one_more(before.session, status.session):
             self.bell()
-        if not self._greeted:
-            self._greeted = True
+        if before is None:  # connected, perhaps to another daemon than before
             self.known = replace(self.known, configuration=self.link.client.config)
-            if status.state is StationState.DISCONNECTED and not status.playback:
+            if not self._greeted and status.state is StationState.DISCONNECTED and not status.playback:
                 self.switch_mode("connect")
+            self._greeted = True
             if not self.known.works:
                 self.action_look_at_checks()
 

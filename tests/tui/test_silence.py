@@ -15,7 +15,7 @@ from station.tui.capture_screen import CaptureScreen
 from station.tui.daemon_link import STOP_UNHEARD
 from station.tui.task import SILENT
 from station.tui.widgets.preview import OLD, PreviewPane
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
+from tests.tui.conftest import CELL, FakeLink, app_on, idle, in_session, opened, said, text_of, until
 
 
 @pytest.fixture(autouse=True)
@@ -81,6 +81,9 @@ async def test_without_a_daemon_what_it_said_last_stays_and_is_marked_old(link: 
         await until(pilot, lambda: "p08" in text_of(pilot.app, "#progress"))
         assert "NO DAEMON" in text_of(pilot.app, "#bar")
         assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 of 25: OLD"
+        link.config = msgspec.structs.replace(CELL, name="another cell")  # the next daemon's
+        link.show(idle())
+        await until(pilot, lambda: pilot.app.known.configuration == link.config)
 
 
 @pytest.mark.parametrize(("heard", "told"), [(True, "without a connection"), (False, "EMERGENCY STOP")])

@@ -73,7 +73,7 @@ class Cell:
         """Say why a real arm's stops are not accepted; empty: they are, or no real arm moves."""
         if self.mover is None or self.source != "real":
             return ""
-        if not self.arm.identity.serial or not self.mover.control_path:
+        if not self.arm.identity.controller_version or not self.mover.control_path:  # not connected
             return ""
         speed_m_s = min(self.config.limits.speed_m_s, SPEED_CAP_M_S)
         return not_accepted(read_acceptance(root), self.subject, speed_m_s)

@@ -79,6 +79,8 @@ def read_touch(board: SeenBoard, corner: int, status: StationStatus | None) -> T
     robot = None if status is None else status.robot
     if robot is None or robot.state is None or robot.identity is None:
         raise RefusedError("no-robot-state")
+    if not robot.still:
+        raise RefusedError("arm-moves")
     points = board_points(board.calibration.board)
     flange = flange_pose(robot.state, robot.identity.tcp_offset)
     touching = transform_points(flange, np.array(board.tip_m))

@@ -49,7 +49,7 @@ class ArmInMemory:
     """Arrives at once, or when `arrive` is set while `slow`. Speaks of what it was asked in `log`."""
 
     def __init__(self) -> None:
-        self.identity = RobotIdentity(model="UR10", serial="DOUBLE")
+        self.identity = RobotIdentity(model="UR10", serial="DOUBLE", controller_version="5.15.0")
         self.joints = TRUTH.start_joints_rad
         self.log: list[str] = []
         self.control, self.notice, self.remote = False, "", None

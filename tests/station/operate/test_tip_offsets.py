@@ -66,13 +66,13 @@ class Daemon:
         write_calibration(self.calibration, folder / "c.yaml")
         return await see_board(self, folder / "c.yaml")
 
-    def touching(self, place_m: Array, tip_m: tuple[float, ...] = TIP) -> StationStatus:
+    def touching(self, place_m: Array, tip_m: tuple[float, ...] = TIP, still: bool = True) -> StationStatus:
         """The arm with the tip there in `board`, however the flange is turned."""
         R = rotation_exp([0.4, 2.8, -0.1])
         flange = pose(R, (self.board @ [*place_m, 1.0])[:3] - R @ tip_m)
         tcp_pose = (*flange[:3, 3].tolist(), *rotation_log(flange[:3, :3]).tolist())  # no pendant offset
         state = msgspec.structs.replace(make_state(0), tcp_pose=tcp_pose)
-        return StationStatus(robot=RobotStatus(RobotIdentity(), state))
+        return StationStatus(robot=RobotStatus(RobotIdentity(), state, still=still))
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
@@ -127,6 +127,8 @@ async def test_what_is_not_known_and_another_cell_are_refused(tmp_path: Path) ->
     for status in (None, StationStatus()):
         with raises("no-robot-state"):
             read_touch(board, CORNER, status)
+    with raises("arm-moves"):
+        read_touch(board, CORNER, daemon.touching(board_points(daemon.truth.board)[CORNER], still=False))
     bare = Daemon(tcp_offset=(0.0,) * 6)
     bare.config = msgspec.structs.replace(bare.config, pointer=None)
     for other, code in (

@@ -38,6 +38,7 @@ _LEAST = float(np.log(1e-2))
 Sizes = tuple[int, int, int]
 """Places in `SIZES` of the links' shifts and turns, and in `BENDS`."""
 _NONE: Sizes = (0, 0, 0)
+"""Errors that cannot be told from none."""
 
 
 class _Sizes:

@@ -28,10 +28,13 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
     camera.set_range_check_policy(aravis.RangeCheckPolicy.ENABLE)
     camera.stop_acquisition()
     camera.clear_triggers()
-    # Cameras keep what the last program set: automatic functions, or an exposure as long as the pulse.
+    # Cameras keep what the last program set.
     for name, value in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("ExposureMode", "Timed")):
         if camera.is_feature_available(name) and camera.get_string(name) != value:
             camera.set_string(name, value)
+    for name in ("ReverseX", "ReverseY"):  # no lens fits a mirrored image, nor does a board
+        if camera.is_feature_available(name) and camera.get_boolean(name):
+            camera.set_boolean(name, False)
     camera.set_pixel_format_from_string(config.pixel_format)
     region: Region = config.region or (0, 0, *camera.get_sensor_size())
     camera.set_region(*region)

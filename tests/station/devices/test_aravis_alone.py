@@ -184,9 +184,12 @@ class Settable:
     def is_feature_available(self, name: str) -> bool:
         return True
 
+    def get_boolean(self, name: str) -> bool:
+        return name == "ReverseX"
+
     def __getattr__(self, name: str) -> Any:
         return lambda *values: self.set.__setitem__(
-            f"{name} {values[0]}" if name == "set_string" else name, values
+            f"{name} {values[0]}" if name in ("set_string", "set_boolean") else name, values
         )
 
 
@@ -217,6 +220,7 @@ def test_the_whole_sensor_is_set_with_the_right_trigger_and_automatics_off(trigg
     assert camera.set["set_string ExposureAuto"] == ("ExposureAuto", "Off")
     assert camera.set["set_string GainAuto"] == ("GainAuto", "Off")
     assert camera.set["set_string ExposureMode"] == ("ExposureMode", "Timed"), "not as long as the pulse"
+    assert camera.set["set_boolean ReverseX"] == ("ReverseX", False), "no mirrored image"
     assert camera.set["set_acquisition_mode"] == ("continuous",) and camera.set["set_chunk_mode"] == (False,)
 
 

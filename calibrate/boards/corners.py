@@ -17,6 +17,8 @@ _WINDOW_SHARE = 0.35
 """Half window of the refinement over the local spacing: as much edge as possible, no other corner."""
 _LARGEST_HALF_WINDOW_PX = 16
 _IRREGULAR_SHARE = 0.3
+_ALTERNATE = 0.6
+"""Share of neighbouring squares that differ as they must, less the share that differ the other way."""
 _REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 5e-3)
 _SMOOTHING_PX = 1.0
 _MARGIN_PX = 16
@@ -40,6 +42,18 @@ def to_grey(image: Pixels) -> Grey:
 def equalise(grey: Grey) -> Grey:
     """Spread contrast over the whole image; for finding, not for measuring."""
     return np.asarray(cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey))
+
+
+def through(H: Array, points: Array) -> Array:
+    """Map points (n, 2) by a homography."""
+    moved: Any = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
+    return np.asarray(moved.reshape(-1, 2))
+
+
+def steps(H: Array, points: Array, length: float = 1.0) -> tuple[Array, Array]:
+    """Find the images (n, 2) of a step along x and of one along y at points (n, 2) of a plane."""
+    across, down = (through(H, points + half) - through(H, points - half) for half in np.eye(2) * length / 2)
+    return across, down
 
 
 def local_spacing(grid: Array) -> Array:
@@ -117,20 +131,57 @@ def sample(grey: Grey, pixels: Array) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
-def square_means(grey: Grey, grid: Array) -> Array:
-    """Sample grey values (rows - 1, columns - 1) in the squares between corners (rows, columns, 2)."""
-    centres = np.round((grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4).astype(int)
-    around = np.arange(-1, 2)
-    rows = np.clip(centres[..., 1, None] + around, 0, grey.shape[0] - 1)
-    columns = np.clip(centres[..., 0, None] + around, 0, grey.shape[1] - 1)
-    return np.asarray(grey[rows[..., :, None], columns[..., None, :]].mean(axis=(-2, -1)))
+def sample_ring(grey: Grey, centres: Array, across: Array, down: Array) -> Array:
+    """Sample 16 grey values (n, 16) round each centre (n, 2), on the ellipse with these half axes (n, 2)."""
+    angles = np.arange(16) * (2 * np.pi / 16)
+    circle = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * down[:, None]
+    return sample(grey, centres[:, None] + circle)
+
+
+def is_saddle(grey: Grey, corners: Array, across: Array, down: Array) -> NDArray[np.bool_]:
+    """Tell chessboard corners: round them bright and dark alternate twice, opposite sides alike.
+
+    corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the image.
+    """
+    ring = sample_ring(grey, corners, across, down)
+    ring -= ring.mean(axis=1, keepdims=True)
+    spectrum = np.abs(np.fft.rfft(ring, axis=1)) ** 2
+    share = spectrum[:, 2] / np.maximum(spectrum[:, 1:].sum(axis=1), 1e-9)
+    return np.asarray((share > 0.6) & (ring.std(axis=1) > 4.0))
+
+
+def square_greys(grey: Grey, grid: Array) -> Array:
+    """Sample the four quarters of the squares between corners (r, c, 2): greys (4, r - 1, c - 1)."""
+    quarters = []
+    for down in (0.25, 0.75):
+        edge = (1 - down) * grid[:-1] + down * grid[1:]
+        quarters += [(1 - across) * edge[:, :-1] + across * edge[:, 1:] for across in (0.25, 0.75)]
+    return sample(grey, np.concatenate(quarters)).reshape(4, len(grid) - 1, -1)
+
+
+def contrasts(greys: Array) -> tuple[Array, Array]:
+    """Compare neighbouring squares down and across: of one sign where they are dark and light in turn.
+
+    greys: those of `square_greys` (4, r, c); returns (4, r - 1, c) and (4, r, c - 1).
+    """
+    signs = np.where(np.indices(greys.shape[1:]).sum(axis=0) % 2, -1, 1)
+    return np.diff(greys, axis=1) * signs[1:], np.diff(greys, axis=2) * signs[:, 1:]
+
+
+def alternate(greys: Array) -> bool:
+    """Tell whether squares are dark and light in turn: not those of a grid that skips a row of corners.
+
+    Only signs count, so that light may fall off.
+    """
+    signs = np.concatenate([np.sign(each).reshape(4, -1) for each in contrasts(greys)], axis=1)
+    return bool(abs(signs.mean()) > _ALTERNATE)
 
 
 def square_contrast(means: Array, mean_grey: float) -> float:
     """Compare squares at odd and even places: brightness difference over the spread; > 0: first is dark.
 
-    means: those of `square_means`. Value in about -1 … 1; near 0 the colours decide nothing. A single
-    square is compared with the image's `mean_grey`.
+    means: grey of each square. Value in about -1 … 1; near 0 the colours decide nothing. A single square is
+    compared with the image's `mean_grey`.
     """
     odd = np.indices(means.shape).sum(axis=0) % 2 == 1
     if odd.all() or not odd.any():

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.boards.corners import Grey, to_grey
-from calibrate.boards.grids import find_chessboard, find_circles, other_size
-from calibrate.boards.markers import find_april_grid, find_charuco, find_tag
+from calibrate.boards.grids import count_circles, find_chessboard, find_circles, other_size
+from calibrate.boards.markers import find_april_grid, find_charuco, find_tag, misplaced
 from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
 from calibrate.geometry import Array
 from recordings.images import Pixels
@@ -128,6 +128,16 @@ def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool
         return "over-exposed", "the image is over-exposed: more than half of it is saturated"
     if float(grey.std()) < 3.0:
         return "empty", f"the image is empty (grey {level:.0f}, no contrast)"
+    if (
+        thorough
+        and spec.kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID)
+        and (tags := misplaced(grey, spec))
+    ):
+        return "other-board", f"{tags} of its markers are seen, placed as on a board of other columns or rows"
+    if thorough and spec.kind in (BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES):
+        circles, expected = count_circles(grey), spec.columns * spec.rows
+        if circles > expected:
+            return "other-board", f"board of {expected} circles expected, {circles} seen: another board"
     seen = other_size(grey, spec) if thorough and spec.kind is BoardKind.CHESSBOARD else None
     if seen is None or sorted(seen) == sorted((spec.columns, spec.rows)):
         return "not-found", f"no {describe_board(spec)} found"

@@ -19,13 +19,19 @@ from scipy.spatial import KDTree
 
 from calibrate.boards.corners import (
     Grey,
+    alternate,
+    contrasts,
     equalise,
     is_regular,
     local_spacing,
     refine,
     right_handed,
+    sample,
+    sample_ring,
     square_contrast,
-    square_means,
+    square_greys,
+    steps,
+    through,
 )
 from calibrate.boards.model import board_points, looks_same_turns
 from calibrate.geometry import Array
@@ -56,7 +62,9 @@ def find_chessboard(
             continue
         flat = refine(grey, grid.reshape(-1, 2), spacing.ravel())
         grid = flat.reshape(grid.shape)
-        if is_regular(grid):
+        if is_regular(grid) and alternate(square_greys(grey, grid)):
+            if _goes_on(grey, grid, spec):
+                return None
             return _orient(grey, grid, spec).reshape(-1, 2)
     return None
 
@@ -102,9 +110,45 @@ def _orient(grey: Grey, grid: Array, spec: BoardSpec) -> Array:
     if len(looks_same_turns(spec)) == len(turns):
         return grid
     # Among the turns that the colours allow, the first corner nearest the image's top left.
-    means, grey_level = square_means(grey, grid), float(cv2.mean(grey)[0])
+    means, grey_level = square_greys(grey, grid).mean(axis=0), float(cv2.mean(grey)[0])
     dark_first = [t for t in turns if square_contrast(np.rot90(means, t), grey_level) > 0] or turns
     return min((np.rot90(grid, t) for t in dark_first), key=lambda c: float(c[0, 0].sum()))
+
+
+def _goes_on(grey: Grey, grid: Array, spec: BoardSpec) -> bool:
+    """Tell whether the pattern goes on beyond a side of the grid: it is a part of a larger board's."""
+    j, i = np.meshgrid(np.arange(-2.0, spec.columns + 2), np.arange(-2.0, spec.rows + 2))
+    asymmetric = spec.kind is BoardKind.ASYMMETRIC_CIRCLES
+    plane = np.stack([2 * j + i % 2 if asymmetric else j, i], axis=-1)
+    found: Any = cv2.findHomography(plane[2:-2, 2:-2].reshape(-1, 2), grid.reshape(-1, 2), 0)
+    H, last = found[0], np.array(grey.shape[::-1]) - 1
+    if H is None:
+        return False
+    chessboard = spec.kind is BoardKind.CHESSBOARD
+    for turn in range(4):
+        beyond = np.rot90(plane, turn)[0 if chessboard else 1 : 3, 2:-2]  # the last row is the grid's own
+        pixels = through(H, beyond.reshape(-1, 2)).reshape(beyond.shape)
+        if ((pixels < 0) | (pixels > last)).any():
+            continue
+        if chessboard:
+            next_squares, outermost = np.moveaxis(contrasts(square_greys(grey, pixels))[1].mean(axis=2), 1, 0)
+            goes_on = bool((next_squares * outermost.mean() > 0.5 * outermost.mean() ** 2).all())
+        else:
+            other, own = (_centres_and_rings(grey, H, row, 0.7 if asymmetric else 0.5) for row in beyond)
+            paper = np.median(own[:, 1:])
+            contrast = np.median(own[:, 0]) - paper
+            inked = (other - paper) * contrast > 0.5 * contrast**2
+            goes_on = bool((inked[:, 0] & ~inked[:, 1:].any(axis=1)).mean() > 0.5)
+        if goes_on:
+            return True
+    return False
+
+
+def _centres_and_rings(grey: Grey, H: Array, at: Array, radius: float) -> Array:
+    """Sample grey values (n, 17) at points (n, 2) of the plane, and on circles of this radius round them."""
+    across, down = (radius * step for step in steps(H, at))
+    centres = through(H, at)
+    return np.column_stack([sample(grey, centres[:, None]), sample_ring(grey, centres, across, down)])
 
 
 def other_size(grey: Grey, spec: BoardSpec) -> tuple[int, int] | None:
@@ -188,8 +232,17 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
                     if group is not None:
                         seen = group[np.linalg.norm(seen[:, None] - group, axis=2).argmin(axis=1)]
                     ordered = _best_order(seen, spec)
-                    return None if ordered is None else true_centres(grey, ordered, spec)
+                    if ordered is None or not _is_even(ordered, spec) or _goes_on(grey, ordered, spec):
+                        return None
+                    return true_centres(grey, ordered, spec)
     return None
+
+
+def _is_even(centres: Array, spec: BoardSpec) -> bool:
+    """Tell whether the grid varies smoothly; of an asymmetric one every second row."""
+    grid = centres.reshape(spec.rows, spec.columns, 2)
+    apart = 2 if spec.kind is BoardKind.ASYMMETRIC_CIRCLES else 1
+    return all(is_regular(grid[first::apart]) for first in range(apart))
 
 
 def _painted(centres: Array, like: Grey) -> Grey:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import lru_cache
 from typing import Any
 
@@ -9,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.corners import Grey, equalise, local_spacing, refine, sample
+from calibrate.boards.corners import Grey, equalise, is_saddle, local_spacing, refine, steps, through
 from calibrate.boards.model import board_points, dictionary_id, tag_dictionary
 from calibrate.geometry import Array
-from recordings.schema.messages import BoardSpec
+from recordings.schema.messages import BoardKind, BoardSpec
 
 _FEW_MARKERS = 0.7
 """Share of the markers of the board."""
@@ -20,6 +21,11 @@ _SMALL_MARKER_PX, _ENLARGED, _LARGEST_SIDE_PX = 20.0, 3.0, 6000
 """Markers with shorter sides are read in an enlarged image, unless that would be larger than this."""
 _SMALLEST_PERIMETER = 0.03
 """Perimeter of a marker over the longer side of the image; OpenCV's own."""
+_ASTRAY, _MOST = 0.25, 0.75
+_TELLING = 4
+"""Farther than this share of its side from where the board has it, a marker does not lie as printed; share of
+the markers that must. Of a board in the legacy order half of them do. As many seen tell another
+board."""
 _NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
 """A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
 and than so many times the middle one."""
@@ -36,60 +42,79 @@ def charuco_board(spec: BoardSpec) -> Any:
     return board
 
 
+def _printed(spec: BoardSpec) -> dict[int, Array]:
+    """List the corners (4, 2) m of every marker of the board, clockwise from its top left."""
+    if spec.kind is BoardKind.APRIL_GRID:  # Kalibr goes counter-clockwise from the bottom left
+        return dict(enumerate(board_points(spec)[:, :2].reshape(-1, 4, 2)[:, ::-1]))
+    board = charuco_board(spec)
+    plane = np.array(board.getObjPoints(), float)[..., :2]
+    return dict(zip(board.getIds().ravel().tolist(), plane, strict=True))
+
+
 def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indices, Array]:
     """Find point indices (k,) and pixels (k, 2) of chessboard corners.
 
     `thorough`: where few markers are seen, the dark parts of the image are brightened; where those are
     small or none, it is enlarged.
     """
-    board = charuco_board(spec)
-    plane_of = dict(zip(board.getIds().ravel().tolist(), board.getObjPoints(), strict=True))
-    seen = _markers(grey, spec, plane_of)
-    few = _FEW_MARKERS * len(plane_of)
+    printed = _printed(spec)
+    detector = marker_detector(spec.dictionary or "", 1)
+    seen = _seen(detector, grey, printed)
+    few = _FEW_MARKERS * len(printed)
     if thorough and len(seen) < few:
-        seen = max(seen, _markers(equalise(grey), spec, plane_of), key=len)
-    if thorough and len(seen) < few and _small(seen) and _ENLARGED * max(grey.shape) <= _LARGEST_SIDE_PX:
-        seen = max(seen, _markers_enlarged(grey, spec, plane_of), key=len)
+        seen = max(seen, _seen(detector, equalise(grey), printed), key=len)
+    small = not seen or _side_px(np.array(list(seen.values()))) < _SMALL_MARKER_PX
+    if thorough and len(seen) < few and small and _ENLARGED * max(grey.shape) <= _LARGEST_SIDE_PX:
+        large: Any = cv2.resize(grey, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)
+        detector = marker_detector(spec.dictionary or "", 1, _SMALLEST_PERIMETER / _ENLARGED)
+        enlarged = _seen(detector, large, printed)
+        seen = max(seen, {i: (marker + 0.5) / _ENLARGED - 0.5 for i, marker in enlarged.items()}, key=len)
     if len(seen) < 2:
         return NOTHING
+    plane, pixels = np.array([printed[i] for i in seen]), np.array(list(seen.values()))
+    H, lies = _as_printed(plane, pixels)
     # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
-    plane = np.concatenate([corners[:, :2] for corners, _ in seen]).astype(float)
-    pixels = np.concatenate([marker.reshape(4, 2) for _, marker in seen]).astype(float)
     points = board_points(spec)[:, :2] + spec.square_m  # OpenCV counts from the outer edge
-    return _snap_to_corners(grey, spec, plane, pixels, points)
+    kept = plane[lies].reshape(-1, 2), pixels[lies].reshape(-1, 2)
+    return _snap_to_corners(grey, spec, H, *kept, points) if lies.any() else NOTHING
 
 
-def _markers(
-    grey: Grey, spec: BoardSpec, plane_of: dict[int, Any], smallest: float = _SMALLEST_PERIMETER
-) -> list[tuple[Any, Any]]:
-    """Corners on the board and in the image of every marker of the board that is seen."""
-    markers, ids, _ = marker_detector(spec.dictionary or "", 1, smallest).detectMarkers(grey)
-    found = [] if ids is None else ids.ravel().tolist()
-    return [(plane_of[i], marker) for i, marker in zip(found, markers, strict=False) if i in plane_of]
+def _seen(detector: Any, image: Any, known: Collection[int]) -> dict[int, Array]:
+    """Number → corners (4, 2) px, clockwise from the top left, of each known marker that is seen once.
+
+    One that is seen twice is on two boards, and nobody knows on which of them.
+    """
+    markers, ids, _ = detector.detectMarkers(image)
+    numbers = [] if ids is None else ids.ravel().tolist()
+    once = {i: np.asarray(m, float).reshape(4, 2) for i, m in zip(numbers, markers, strict=False)}
+    return {i: marker for i, marker in once.items() if i in known and numbers.count(i) == 1}
 
 
-def _markers_enlarged(grey: Grey, spec: BoardSpec, plane_of: dict[int, Any]) -> list[tuple[Any, Any]]:
-    large: Any = cv2.resize(grey, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)
-    seen = _markers(large, spec, plane_of, _SMALLEST_PERIMETER / _ENLARGED)
-    return [(corners, (marker + 0.5) / _ENLARGED - 0.5) for corners, marker in seen]
+def _side_px(markers: Array) -> float:
+    """Median side of markers (n, 4, 2)."""
+    return float(np.median(np.linalg.norm(np.diff(markers, axis=1), axis=2)))
 
 
-def _small(seen: list[tuple[Any, Any]]) -> bool:
-    sides = [np.linalg.norm(np.diff(marker.reshape(4, 2), axis=0), axis=1) for _, marker in seen]
-    return not sides or float(np.median(sides)) < _SMALL_MARKER_PX
+def _as_printed(plane: Array, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Find the homography from the board and which markers (n, 4, 2) lie where it has them.
+
+    A few may be misread, or not on the board. None does where more are: that board has other columns or rows.
+    """
+    limit_px = _ASTRAY * _side_px(pixels)
+    found: Any = cv2.findHomography(plane.reshape(-1, 2), pixels.reshape(-1, 2), cv2.RANSAC, limit_px)
+    H = np.full((3, 3), np.nan) if found[0] is None else found[0]
+    shown = through(H, plane.reshape(-1, 2)).reshape(pixels.shape)
+    lies = np.linalg.norm(shown - pixels, axis=2).max(axis=1) < limit_px
+    return H, lies & (lies.mean() >= _MOST)
 
 
 def _snap_to_corners(
-    grey: Grey, spec: BoardSpec, plane: Array, pixels: Array, points: Array
+    grey: Grey, spec: BoardSpec, H: Array, plane: Array, pixels: Array, points: Array
 ) -> tuple[Indices, Array]:
     """Predicts the chessboard corners from marker corners near them, refines, keeps what is a true saddle."""
     from_corner = np.linalg.norm(plane[None] - points[:, None], axis=-1)
-    found: Any = cv2.findHomography(plane, pixels, cv2.RANSAC, 6.0)
-    H = found[0]
-    if H is None:
-        return NOTHING
-    predicted = _apply(H, points)
-    shown = _apply(H, plane)
+    predicted = through(H, points)
+    shown = through(H, plane)
     # The lens bends the plane: shift each prediction by what its nearest markers missed.
     weight = np.exp(-0.5 * (from_corner / spec.square_m) ** 2)
     known = weight.sum(axis=1) > 0.3
@@ -103,10 +128,7 @@ def _snap_to_corners(
         return NOTHING
     # No edge of a marker may come into the window: they run beside the corner, not through it.
     margin_share = 0.5 * (1.0 - (spec.marker_m or 0.0) / spec.square_m)
-    across, down = (
-        _apply(H, points[chosen] + half) - _apply(H, points[chosen] - half)
-        for half in np.eye(2) * spec.square_m / 2
-    )
+    across, down = steps(H, points[chosen], spec.square_m)
     # A tilt about the diagonal brings the markers' corners nearer than any neighbour.
     diagonals = [np.linalg.norm(d, axis=1) / np.sqrt(2) for d in (across + down, across - down)]
     room = np.minimum.reduce([spacing[chosen], *diagonals])
@@ -117,25 +139,6 @@ def _snap_to_corners(
     if good.any():
         good &= moved <= np.maximum(_NEAR_SHARE * room, _FAR_MOVES * np.median(moved[good]))
     return chosen[good], corners[good]
-
-
-def is_saddle(grey: Grey, corners: Array, across: Array, down: Array) -> NDArray[np.bool_]:
-    """Tell chessboard corners: round them bright and dark alternate twice, opposite sides alike.
-
-    corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the image.
-    """
-    angles = np.arange(16) * (2 * np.pi / 16)
-    circle = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * down[:, None]
-    ring = sample(grey, corners[:, None] + circle)
-    ring -= ring.mean(axis=1, keepdims=True)
-    spectrum = np.abs(np.fft.rfft(ring, axis=1)) ** 2
-    share = spectrum[:, 2] / np.maximum(spectrum[:, 1:].sum(axis=1), 1e-9)
-    return np.asarray((share > 0.6) & (ring.std(axis=1) > 4.0))
-
-
-def _apply(H: Array, points: Array) -> Array:
-    moved = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ H.T
-    return np.asarray(moved[:, :2] / moved[:, 2:])
 
 
 @lru_cache(maxsize=8)
@@ -154,31 +157,34 @@ def marker_detector(
 
 def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
     """Find four corners of every tag. Printed borders of one and of two bits (Kalibr) are tried."""
-    best = NOTHING
-    for border_bits in (2, 1):
-        found = _tags(grey, spec, border_bits)
-        if len(found[0]) > len(best[0]):
-            best = found
-    return best
-
-
-def _tags(grey: Grey, spec: BoardSpec, border_bits: int) -> tuple[Indices, Array]:
-    detector = marker_detector(tag_dictionary(spec), border_bits)
-    markers, ids, _ = detector.detectMarkers(grey)
-    if ids is None:
+    seen = _at_a_glance(grey, spec)
+    if not seen:
         return NOTHING
-    numbers, count = ids.ravel().tolist(), spec.columns * spec.rows
-    # A tag that is seen twice is on two boards, and nobody knows on which of them.
-    tags = [(i, m) for i, m in zip(numbers, markers, strict=True) if i < count and numbers.count(i) == 1]
-    if not tags:
+    printed, tags, pixels = _printed(spec), np.array(list(seen)), np.array(list(seen.values()))
+    _, lies = _as_printed(np.array([printed[i] for i in seen]), pixels)
+    if not lies.any():
         return NOTHING
-    # OpenCV goes clockwise from the top left, Kalibr counter-clockwise from the bottom left.
-    corners = np.concatenate([m.reshape(4, 2)[[3, 2, 1, 0]] for _, m in tags]).astype(float)
-    sides = np.repeat([np.linalg.norm(np.diff(m.reshape(4, 2), axis=0), axis=1).min() for _, m in tags], 4)
+    tags, pixels = tags[lies], pixels[lies]
+    sides = np.repeat(np.linalg.norm(np.diff(pixels, axis=1), axis=2).min(axis=1), 4)
     gap_share = (spec.marker_m or spec.square_m) / spec.square_m
-    refined = refine(grey, corners, sides * min(1.0, gap_share))
-    indices = np.concatenate([np.arange(4 * i, 4 * i + 4) for i, _ in tags])
-    return indices.astype(np.intp), refined
+    refined = refine(grey, pixels[:, ::-1].reshape(-1, 2), sides * min(1.0, gap_share))
+    return (4 * tags[:, None] + np.arange(4)).ravel(), refined
+
+
+def _at_a_glance(grey: Grey, spec: BoardSpec) -> dict[int, Array]:
+    """Corners (4, 2) px of the board's markers that are seen at once."""
+    borders = (2, 1) if spec.kind is BoardKind.APRIL_GRID else (1,)
+    detectors = (marker_detector(tag_dictionary(spec), border_bits) for border_bits in borders)
+    return max((_seen(detector, grey, _printed(spec)) for detector in detectors), key=len)
+
+
+def misplaced(grey: Grey, spec: BoardSpec) -> int:
+    """Count the board's markers that are seen where they lie otherwise than on this board."""
+    seen, printed = _at_a_glance(grey, spec), _printed(spec)
+    if len(seen) < _TELLING:
+        return 0
+    _, lies = _as_printed(np.array([printed[i] for i in seen]), np.array(list(seen.values())))
+    return 0 if lies.any() else len(seen)
 
 
 _ROW_BY_ROW = [0, 1, 3, 2]
@@ -208,19 +214,16 @@ def find_tag(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indice
     attempts = [(quick, grey), (other, grey)]
     if thorough:
         attempts.append((other, equalise(grey)))
-    corners = next((seen for each, image in attempts if (seen := _seen(each, image, spec)) is not None), None)
-    if corners is None:
-        return NOTHING
-    return np.arange(4), fit_sides(grey, corners)[_ROW_BY_ROW]
-
-
-def _seen(detector: Any, grey: Grey, spec: BoardSpec) -> Array | None:
-    """(4, 2) clockwise; None also where two tags carry the number: nobody knows which is the board."""
-    markers, ids, _ = detector.detectMarkers(grey)
-    numbers = [] if ids is None else ids.ravel().tolist()
-    if numbers.count(spec.tag_id) != 1:
-        return None
-    return np.asarray(markers[numbers.index(spec.tag_id)].reshape(4, 2), dtype=float)
+    for detector, image in attempts:
+        markers, ids, _ = detector.detectMarkers(image)
+        tags = (
+            [] if ids is None else [np.asarray(markers[k], float) for k in np.flatnonzero(ids == spec.tag_id)]
+        )
+        if len(tags) == 1:
+            return np.arange(4), fit_sides(grey, tags[0].reshape(4, 2))[_ROW_BY_ROW]
+        if tags:  # on two boards, and nobody knows which is meant
+            break
+    return NOTHING
 
 
 def fit_sides(grey: Grey, corners: Array) -> Array:

@@ -110,7 +110,7 @@ def _seen(given: ArrayLike | None, board: BoardSpec) -> _Seen:
     if image.dtype not in (np.uint8, np.uint16) or not plain:
         shape = f"{image.shape} of {image.dtype}"
         raise BadViewsError("shape", what="a picture", given=shape, wanted="(h, w) or (h, w, 3) of uint8")
-    found = detect(image, board, with_quality=False)
+    found = detect(image, board)
     return _Seen(points[found.indices], found.pixels, found.reason, (found.width, found.height))
 
 

@@ -212,7 +212,7 @@ def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera
     height, width = picture.pixels.shape[:2]
     if camera.width:
         require_size(camera, (width, height), view.index, view.name)
-    return detect(viewable(picture.pixels, picture.pixel_format), spec, with_quality=False)
+    return detect(viewable(picture.pixels, picture.pixel_format), spec)
 
 
 def _too_few(

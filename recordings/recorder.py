@@ -202,7 +202,7 @@ class Recorder:
 
     def _work(self) -> None:
         flushed_s = synced_s = self._clock()
-        while (items := self._next()) or not self._ended:
+        while (items := self._next()) is not None:
             if items:
                 self._write(items)
             now_s = self._clock()
@@ -215,16 +215,18 @@ class Recorder:
         if self._finished is not None and not self._finished.done():
             self._finished.set_result(self._writer.finish())
 
-    def _next(self) -> list[_Item]:
+    def _next(self) -> list[_Item] | None:
         """Take the oldest items: states up to and including the first other item.
 
         Another item may be large, or a caller may wait for it, so it is written before more are taken. Empty
-        when none came for a flush period, or when there will be no more.
+        when none came for a flush period; None when there will be no more.
         """
         items: list[_Item] = []
         with self._lock:
             if not self._queue and not self._ended:
                 self._wake.wait(FLUSH_PERIOD_S)
+            if not self._queue and self._ended:
+                return None
             while self._queue:
                 item = self._queue.popleft()
                 self._queued_bytes -= item.size_bytes

@@ -147,7 +147,9 @@ def _recover_file(source: Path, output: Path | None) -> Recovery:
             raise exists_error(final)
         try:
             segment = RecordingSegment(source)
-        except (UnfinishedRecordingError, CorruptRecordingError):
+        except (UnfinishedRecordingError, CorruptRecordingError) as error:
+            if error.code == "not-a-recording":  # whole, and of another program
+                raise
             return _rebuild(descriptor, source, final, in_place=output is None)
         if output is None and source.name.endswith(PART_SUFFIX):  # only its last rename was missing
             rename_new(source, final)
@@ -240,7 +242,8 @@ def _declare_by_records(contents: Contents) -> None:
     """Declare the channels of this station whose declaration is lost with its chunk."""
     for name, record in contents.metadata.items():
         number = name.removeprefix(CHANNEL_RECORDS)
-        if number != name and number.isdecimal() and int(number) not in contents.channels:
+        known = number != name and number.isdecimal() and record.get("topic") in set(Topic)
+        if known and int(number) not in contents.channels:
             topic = Topic(record["topic"])
             schema = Schema(-int(number), schema_bytes(topic), "protobuf", schema_name(topic))
             contents.schemas[schema.id] = schema

@@ -17,8 +17,6 @@ _WINDOW_SHARE = 0.35
 """Half window of the refinement over the local spacing: as much edge as possible, no other corner."""
 _LARGEST_HALF_WINDOW_PX = 16
 _IRREGULAR_SHARE = 0.3
-_ALTERNATE = 0.6
-"""Share of neighbouring squares that differ as they must, less the share that differ the other way."""
 _REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 5e-3)
 _SMOOTHING_PX = 1.0
 _MARGIN_PX = 16
@@ -48,12 +46,6 @@ def through(H: Array, points: Array) -> Array:
     """Map points (n, 2) by a homography."""
     moved: Any = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(moved.reshape(-1, 2))
-
-
-def steps(H: Array, points: Array, length: float = 1.0) -> tuple[Array, Array]:
-    """Find the images (n, 2) of a step along x and of one along y at points (n, 2) of a plane."""
-    across, down = (through(H, points + half) - through(H, points - half) for half in np.eye(2) * length / 2)
-    return across, down
 
 
 def local_spacing(grid: Array) -> Array:
@@ -131,25 +123,6 @@ def sample(grey: Grey, pixels: Array) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
-def sample_ring(grey: Grey, centres: Array, across: Array, down: Array) -> Array:
-    """Sample 16 grey values (n, 16) round each centre (n, 2), on the ellipse with these half axes (n, 2)."""
-    angles = np.arange(16) * (2 * np.pi / 16)
-    circle = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * down[:, None]
-    return sample(grey, centres[:, None] + circle)
-
-
-def is_saddle(grey: Grey, corners: Array, across: Array, down: Array) -> NDArray[np.bool_]:
-    """Tell chessboard corners: round them bright and dark alternate twice, opposite sides alike.
-
-    corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the image.
-    """
-    ring = sample_ring(grey, corners, across, down)
-    ring -= ring.mean(axis=1, keepdims=True)
-    spectrum = np.abs(np.fft.rfft(ring, axis=1)) ** 2
-    share = spectrum[:, 2] / np.maximum(spectrum[:, 1:].sum(axis=1), 1e-9)
-    return np.asarray((share > 0.6) & (ring.std(axis=1) > 4.0))
-
-
 def square_greys(grey: Grey, grid: Array) -> Array:
     """Sample the four quarters of the squares between corners (r, c, 2): greys (4, r - 1, c - 1)."""
     quarters = []
@@ -168,22 +141,10 @@ def contrasts(greys: Array) -> tuple[Array, Array]:
     return np.diff(greys, axis=1) * signs[1:], np.diff(greys, axis=2) * signs[:, 1:]
 
 
-def alternate(greys: Array) -> bool:
-    """Tell whether squares are dark and light in turn: not those of a grid that skips a row of corners.
+def alternation(greys: Array) -> float:
+    """Tell how far squares are light and dark in turn, -1 … 1: negative where the first one is dark.
 
-    Only signs count, so that light may fall off.
+    Near 0 for a grid that skips rows of corners. Only signs count, so that light may fall off.
     """
     signs = np.concatenate([np.sign(each).reshape(4, -1) for each in contrasts(greys)], axis=1)
-    return bool(abs(signs.mean()) > _ALTERNATE)
-
-
-def square_contrast(means: Array, mean_grey: float) -> float:
-    """Compare squares at odd and even places: brightness difference over the spread; > 0: first is dark.
-
-    means: grey of each square. Value in about -1 … 1; near 0 the colours decide nothing. A single square is
-    compared with the image's `mean_grey`.
-    """
-    odd = np.indices(means.shape).sum(axis=0) % 2 == 1
-    if odd.all() or not odd.any():
-        return 0.0 if means.size == 0 else float(np.sign(mean_grey - means.mean()))
-    return float((means[odd].mean() - means[~odd].mean()) / (2 * (means.std() + 1e-9)))
+    return float(signs.mean())

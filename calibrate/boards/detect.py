@@ -51,11 +51,8 @@ class Detection:
     """Points of the whole board."""
     width: int
     height: int
-    sharpness: float
-    """Mean squared Laplacian over the variance of the grey values, on the board (whole image if none); NaN
-    when not asked for."""
     saturated: float
-    """Share of pixels at the upper end of the scale there, 0 … 1; NaN when not asked for."""
+    """Share of pixels at the upper end of the scale on the board (whole image if none), 0 … 1."""
     coverage: float
     """Share of the image inside the outline of the points, 0 … 1."""
 
@@ -68,15 +65,12 @@ class Detection:
         return len(self.indices)
 
 
-def detect(
-    image: Pixels, spec: BoardSpec, thorough: bool = True, with_quality: bool = True, exhaustive: bool = True
-) -> Detection:
+def detect(image: Pixels, spec: BoardSpec, thorough: bool = True, exhaustive: bool = True) -> Detection:
     """Find the board to sub-pixel accuracy.
 
     image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the
-    search for the reason (previews), `exhaustive=False` the slowest and that search, `with_quality=False` the
-    sharpness and the saturation. Raises BoardError for an impossible board; an image without a board is an
-    answer, not an error.
+    search for the reason (previews), `exhaustive=False` the slowest and that search. Raises BoardError for an
+    impossible board; an image without a board is an answer, not an error.
     """
     check_board(spec)
     grey = to_grey(image)
@@ -90,10 +84,9 @@ def detect(
     cause, reason = ("", "") if found else _reason(grey, spec, len(indices), fewest, thorough and exhaustive)
     if not found:
         indices, pixels = indices[:0], pixels[:0]
-    sharpness, saturated = _picture_quality(grey, pixels) if with_quality else (np.nan, np.nan)
     area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if found else 0.0
     share = area / (width * height)
-    return Detection(cause, reason, indices, pixels, expected, width, height, sharpness, saturated, share)
+    return Detection(cause, reason, indices, pixels, expected, width, height, _saturated(grey, pixels), share)
 
 
 def _find(
@@ -155,15 +148,10 @@ def _seen_in_a_mirror(grey: Grey, spec: BoardSpec) -> bool:
     return len(indices) >= min(FEWEST_POINTS, len(board_points(spec)))
 
 
-def _picture_quality(grey: Grey, pixels: Array) -> tuple[float, float]:
+def _saturated(grey: Grey, pixels: Array) -> float:
+    region = grey
     if len(pixels):
         x0, y0 = np.maximum(np.floor(pixels.min(axis=0)).astype(int), 0)
         x1, y1 = np.ceil(pixels.max(axis=0)).astype(int) + 1
         region = grey[y0:y1, x0:x1]
-    else:
-        region = grey
-    laplacian = cv2.Laplacian(region, cv2.CV_16S)
-    energy = cv2.norm(laplacian, cv2.NORM_L2SQR) / region.size
-    _, spread = cv2.meanStdDev(region)
-    saturated = cv2.countNonZero(cv2.inRange(region, _SATURATED_GREY, 255)) / region.size
-    return energy / (float(spread[0, 0]) ** 2 + 1e-6), saturated
+    return cv2.countNonZero(cv2.inRange(region, _SATURATED_GREY, 255)) / region.size

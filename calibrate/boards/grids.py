@@ -19,18 +19,14 @@ from scipy.spatial import KDTree
 
 from calibrate.boards.corners import (
     Grey,
-    alternate,
+    alternation,
     contrasts,
     equalise,
     is_regular,
     local_spacing,
     refine,
     right_handed,
-    sample,
-    sample_ring,
-    square_contrast,
     square_greys,
-    steps,
     through,
 )
 from calibrate.boards.model import board_points, looks_same_turns
@@ -42,6 +38,8 @@ _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _LARGE_SIDE_PX = 1000
 _SMALL_SIDE_PX = 800
 _PREVIEW_SIDE_PX = 640
+_ALTERNATE = 0.6
+"""Share of neighbouring squares that differ as they must, less the share that differ the other way."""
 
 
 def find_chessboard(
@@ -62,7 +60,7 @@ def find_chessboard(
             continue
         flat = refine(grey, grid.reshape(-1, 2), spacing.ravel())
         grid = flat.reshape(grid.shape)
-        if is_regular(grid) and alternate(square_greys(grey, grid)):
+        if is_regular(grid) and abs(alternation(square_greys(grey, grid))) > _ALTERNATE:
             if _goes_on(grey, grid, spec):
                 return None
             return _orient(grey, grid, spec).reshape(-1, 2)
@@ -110,8 +108,8 @@ def _orient(grey: Grey, grid: Array, spec: BoardSpec) -> Array:
     if len(looks_same_turns(spec)) == len(turns):
         return grid
     # Among the turns that the colours allow, the first corner nearest the image's top left.
-    means, grey_level = square_greys(grey, grid).mean(axis=0), float(cv2.mean(grey)[0])
-    dark_first = [t for t in turns if square_contrast(np.rot90(means, t), grey_level) > 0] or turns
+    greys = square_greys(grey, grid)
+    dark_first = [t for t in turns if alternation(np.rot90(greys, t, (1, 2))) < 0]
     return min((np.rot90(grid, t) for t in dark_first), key=lambda c: float(c[0, 0].sum()))
 
 
@@ -122,9 +120,11 @@ def _goes_on(grey: Grey, grid: Array, spec: BoardSpec) -> bool:
     plane = np.stack([2 * j + i % 2 if asymmetric else j, i], axis=-1)
     found: Any = cv2.findHomography(plane[2:-2, 2:-2].reshape(-1, 2), grid.reshape(-1, 2), 0)
     H, last = found[0], np.array(grey.shape[::-1]) - 1
-    if H is None:
-        return False
     chessboard = spec.kind is BoardKind.CHESSBOARD
+    blobs = () if chessboard else _blobs(grey.size / len(grid)).detect(grey)
+    at, size = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
+    if H is None or not (chessboard or len(blobs)):
+        return False
     for turn in range(4):
         beyond = np.rot90(plane, turn)[0 if chessboard else 1 : 3, 2:-2]  # the last row is the grid's own
         pixels = through(H, beyond.reshape(-1, 2)).reshape(beyond.shape)
@@ -134,21 +134,16 @@ def _goes_on(grey: Grey, grid: Array, spec: BoardSpec) -> bool:
             next_squares, outermost = np.moveaxis(contrasts(square_greys(grey, pixels))[1].mean(axis=2), 1, 0)
             goes_on = bool((next_squares * outermost.mean() > 0.5 * outermost.mean() ** 2).all())
         else:
-            other, own = (_centres_and_rings(grey, H, row, 0.7 if asymmetric else 0.5) for row in beyond)
-            paper = np.median(own[:, 1:])
-            contrast = np.median(own[:, 0]) - paper
-            inked = (other - paper) * contrast > 0.5 * contrast**2
-            goes_on = bool((inked[:, 0] & ~inked[:, 1:].any(axis=1)).mean() > 0.5)
+            own = float(np.median(size[KDTree(at).query(pixels[1])[1]]))
+            alike = (size > own / _AS_LARGE) & (size < own * _AS_LARGE)
+            away_px, step_px = (
+                KDTree(at[alike]).query(pixels[0])[0],
+                np.linalg.norm(pixels[1] - pixels[0], axis=1),
+            )
+            goes_on = bool((away_px < _NEXT * step_px).mean() > 0.5)
         if goes_on:
             return True
     return False
-
-
-def _centres_and_rings(grey: Grey, H: Array, at: Array, radius: float) -> Array:
-    """Sample grey values (n, 17) at points (n, 2) of the plane, and on circles of this radius round them."""
-    across, down = (radius * step for step in steps(H, at))
-    centres = through(H, at)
-    return np.column_stack([sample(grey, centres[:, None]), sample_ring(grey, centres, across, down)])
 
 
 def other_size(grey: Grey, spec: BoardSpec) -> tuple[int, int] | None:
@@ -178,6 +173,8 @@ _AS_LARGE = 1.4
 """Circles of one grid differ by less than this factor in size, unless seen from very near."""
 _TOGETHER = 2.5
 """Neighbours of one grid are nearer than so many of its circles' widths."""
+_NEXT = 0.3
+"""A circle nearer than this share of a step to where the grid would go on continues it."""
 _GUESSED_PX = 1.5
 """Farther than this from the middle of the ink a centre was guessed, not found."""
 
@@ -217,7 +214,7 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
     count = spec.columns * spec.rows
-    for image in (grey, cv2.bitwise_not(grey)):
+    for image in (grey, np.asarray(cv2.bitwise_not(grey), np.uint8)):
         groups = (each for each in _together(image, grey.size / count) if count <= len(each) < 2 * count)
         for group in chain(groups, [None]):  # OpenCV loses a grid among other blobs
             for clustering in (0, cv2.CALIB_CB_CLUSTERING):
@@ -232,7 +229,7 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
                     if group is not None:
                         seen = group[np.linalg.norm(seen[:, None] - group, axis=2).argmin(axis=1)]
                     ordered = _best_order(seen, spec)
-                    if ordered is None or not _is_even(ordered, spec) or _goes_on(grey, ordered, spec):
+                    if ordered is None or not _is_even(ordered, spec) or _goes_on(image, ordered, spec):
                         return None
                     return true_centres(grey, ordered, spec)
     return None

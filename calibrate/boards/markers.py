@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.corners import Grey, equalise, is_saddle, local_spacing, refine, steps, through
+from calibrate.boards.corners import Grey, equalise, local_spacing, refine, sample, through
 from calibrate.boards.model import board_points, dictionary_id, tag_dictionary
 from calibrate.geometry import Array
 from recordings.schema.messages import BoardKind, BoardSpec
@@ -57,12 +57,10 @@ def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[In
     `thorough`: where few markers are seen, the dark parts of the image are brightened; where those are
     small or none, it is enlarged.
     """
-    printed = _printed(spec)
-    detector = marker_detector(spec.dictionary or "", 1)
-    seen = _seen(detector, grey, printed)
+    printed, seen = _printed(spec), _at_a_glance(grey, spec)
     few = _FEW_MARKERS * len(printed)
     if thorough and len(seen) < few:
-        seen = max(seen, _seen(detector, equalise(grey), printed), key=len)
+        seen = max(seen, _at_a_glance(equalise(grey), spec), key=len)
     small = not seen or _side_px(np.array(list(seen.values()))) < _SMALL_MARKER_PX
     if thorough and len(seen) < few and small and _ENLARGED * max(grey.shape) <= _LARGEST_SIDE_PX:
         large: Any = cv2.resize(grey, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)
@@ -128,7 +126,10 @@ def _snap_to_corners(
         return NOTHING
     # No edge of a marker may come into the window: they run beside the corner, not through it.
     margin_share = 0.5 * (1.0 - (spec.marker_m or 0.0) / spec.square_m)
-    across, down = steps(H, points[chosen], spec.square_m)
+    across, down = (
+        through(H, points[chosen] + half) - through(H, points[chosen] - half)
+        for half in np.eye(2) * spec.square_m / 2
+    )
     # A tilt about the diagonal brings the markers' corners nearer than any neighbour.
     diagonals = [np.linalg.norm(d, axis=1) / np.sqrt(2) for d in (across + down, across - down)]
     room = np.minimum.reduce([spacing[chosen], *diagonals])
@@ -139,6 +140,20 @@ def _snap_to_corners(
     if good.any():
         good &= moved <= np.maximum(_NEAR_SHARE * room, _FAR_MOVES * np.median(moved[good]))
     return chosen[good], corners[good]
+
+
+def is_saddle(grey: Grey, corners: Array, across: Array, down: Array) -> NDArray[np.bool_]:
+    """Tell chessboard corners: round them bright and dark alternate twice, opposite sides alike.
+
+    corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the image.
+    """
+    angles = np.arange(16) * (2 * np.pi / 16)
+    circle = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * down[:, None]
+    ring = sample(grey, corners[:, None] + circle)
+    ring -= ring.mean(axis=1, keepdims=True)
+    spectrum = np.abs(np.fft.rfft(ring, axis=1)) ** 2
+    share = spectrum[:, 2] / np.maximum(spectrum[:, 1:].sum(axis=1), 1e-9)
+    return np.asarray((share > 0.6) & (ring.std(axis=1) > 4.0))
 
 
 @lru_cache(maxsize=8)

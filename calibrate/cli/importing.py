@@ -62,6 +62,7 @@ def import_command(
     pose_topic: Annotated[
         str | None, typer.Option(help="Topic of the flange's poses, instead of frames.")
     ] = None,
+    joint_topic: Annotated[str | None, typer.Option(help="Topic of the arm's joints.")] = None,
     base: Annotated[str | None, typer.Option(help="Frame of the robot's base.")] = None,
     flange: Annotated[str | None, typer.Option(help="Frame of the flange.")] = None,
     pair_within: Annotated[
@@ -100,7 +101,7 @@ def import_command(
             given = Given(convention, mount, None if board is None else typed_board(board))
             done = _import_found(held, target, told, given, progress)
         else:
-            wanted = Wanted(image_topic, pose_topic, base, flange)
+            wanted = Wanted(image_topic, pose_topic, base, flange, joint_topic)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
             done = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
     size_bytes = target.stat().st_size if target else 0

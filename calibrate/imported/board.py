@@ -155,7 +155,7 @@ def _search(
             if path not in left or (harder and (enough or missed > _TRIED)):
                 continue
             progress(n, len(images), f"looking for a {board.kind.value} {board.columns}×{board.rows}")
-            seen = detect(image, board, harder, with_quality=False, exhaustive=False)
+            seen = detect(image, board, harder, exhaustive=False)
             missed = 0 if seen.found or (known and len(left) < len(images)) else missed + 1
             if seen.found:
                 del left[path]
@@ -178,9 +178,9 @@ def _likely(
             for _, larger, knew in counted
         )  # of a board that one image shows whole
         try:
-            if part or (shown is not None and not detect(shown, board, True, False, False).found):
+            if part or (shown is not None and not detect(shown, board, True, False).found):
                 continue
-            seen = [detect(image, board, False, with_quality=False) for image in images]
+            seen = [detect(image, board, False) for image in images]
         except CalibrationError:
             continue
         often = 2 * sum(found.found for found in seen) >= len(seen) and known

@@ -10,9 +10,9 @@ from __future__ import annotations
 from itertools import chain
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError, wrong_size_error
 from recordings.images import (
@@ -123,24 +123,19 @@ def _camera(described: Dataset, found: CameraModel | None, first: Pixels) -> Cam
 
 
 def _write_states(writer: RecordingWriter, chosen: Selection) -> None:
-    """Robot states of an arm of six joints, its tool as dataset.yaml tells it."""
+    """Robot states from the joints, the arm's tool as dataset.yaml tells it."""
     joints = chosen.joints
-    if joints is None or joints.positions_rad.shape[1] != 6:
+    if joints is None:
         return
-    speeds = np.zeros_like(joints.positions_rad) if joints.speeds_rad_s is None else joints.speeds_rad_s
-    flange_from_tcp = matrix_of(writer.info.robot.tcp_offset)
-    for stamp_ns, *told in zip(joints.stamps_ns.tolist(), joints.positions_rad, speeds, strict=True):
-        T = chosen.track.at(np.array([stamp_ns]))[0] @ flange_from_tcp
-        pose = [*T[:3, 3].tolist(), *cv2.Rodrigues(T[:3, :3])[0].ravel().tolist()]
-        at, moving, tcp_pose = (msgspec.convert(list(map(float, six)), Vector6) for six in (*told, pose))
-        state = RobotState(
-            stamps=Stamps(stamp_ns, stamp_ns, controller_s=stamp_ns / 1e9),
-            joints_rad=at,
-            joint_speeds_rad_s=moving,
-            target_joints_rad=at,
-            tcp_pose=tcp_pose,
-        )
-        writer.robot_state(state)
+    T = chosen.track.at(joints.stamps_ns) @ matrix_of(writer.info.robot.tcp_offset)
+    poses = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_rotvec()]).tolist()
+    speeds = [()] * len(poses) if joints.speeds_rad_s is None else joints.speeds_rad_s.tolist()
+    for stamp_ns, at, moving, pose in zip(
+        joints.stamps_ns.tolist(), joints.positions_rad.tolist(), speeds, poses, strict=True
+    ):
+        stamps = Stamps(stamp_ns, stamp_ns, controller_s=stamp_ns / 1e9)
+        tcp_pose = msgspec.convert(pose, Vector6)
+        writer.robot_state(RobotState(stamps, tuple(at), tuple(moving), tuple(at), tcp_pose))
 
 
 def _write_view(

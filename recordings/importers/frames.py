@@ -34,6 +34,8 @@ _UNIT_TOLERANCE = 0.01
 class Edge:
     """parent_from_child over time."""
 
+    latched: bool
+    """Told once and whenever it changes: it holds until it is told anew."""
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     numbers: array[float] = field(default_factory=lambda: array("d"))
     """Seven a sample: position, quaternion x y z w."""
@@ -57,7 +59,8 @@ class FrameTree:
         self.edges: dict[tuple[str, str], Edge] = {}
         self._samples = 0
 
-    def add(self, frames: Iterable[FrameMessage]) -> None:
+    def add(self, frames: Iterable[FrameMessage], latched: bool = False) -> None:
+        """Take in frames; `latched`: those of a topic of static transforms."""
         for frame in frames:
             numbers = (*frame.position_m, *frame.rotation_xyzw)
             length = float(np.linalg.norm(frame.rotation_xyzw))
@@ -68,7 +71,8 @@ class FrameTree:
             self._samples += 1
             if self._samples > SAMPLES_LIMIT:
                 raise ImportSourceError("too-many-frames", limit=SAMPLES_LIMIT)
-            edge = self.edges.setdefault((frame.parent.lstrip("/"), frame.child.lstrip("/")), Edge())
+            edge = self.edges.setdefault((frame.parent.lstrip("/"), frame.child.lstrip("/")), Edge(latched))
+            edge.latched &= latched
             edge.stamps_ns.append(frame.stamp_ns)
             edge.numbers.extend(numbers)
 
@@ -117,9 +121,9 @@ class FrameTree:
         return ImportSourceError("no-frames", base=base, flange=flange, frames=names)
 
     def moves(self, pair: tuple[str, str]) -> bool:
-        """Tell whether a link is ever told to be anywhere else."""
+        """Tell whether a link moves between the times at which it is told."""
         table = np.frombuffer(self.edges[pair].numbers).reshape(-1, 7)
-        return len(table) > 1 and bool(np.ptp(table, axis=0).max() > 0)
+        return not self.edges[pair].latched and bool(np.ptp(table, axis=0).max() > 0)
 
     def track(self, base: str, flange: str) -> Track:
         """base_from_flange over time. ImportSourceError when a chain is not there."""
@@ -140,7 +144,7 @@ class _Link:
     def at(self, times_ns: NDArray[np.int64]) -> tuple[Array, Array]:
         """(positions (n, 3), rotations (n, 3, 3)) of this link, interpolated; the ends are held."""
         if not self.moving:
-            row = np.broadcast_to(self.table[-1], (len(times_ns), 7))
+            row = self.table[np.maximum(np.searchsorted(self.stamps_ns, times_ns, "right") - 1, 0)]
         else:
             after = np.clip(np.searchsorted(self.stamps_ns, times_ns), 1, len(self.stamps_ns) - 1)
             t0, t1 = self.stamps_ns[after - 1], self.stamps_ns[after]

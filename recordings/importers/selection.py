@@ -26,6 +26,7 @@ class Wanted:
     pose_topic: str | None = None
     base: str | None = None
     flange: str | None = None
+    joint_topic: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,9 @@ def select(bag: Bag, wanted: Wanted) -> Selection:
         tree = _tree(bag, [topic.name for topic in frames])
         base, flange = tree.find(wanted.base, wanted.flange)
         said = f"frames {base} → {flange}"
-    return Selection(image, _camera(bag, image), tree.track(base, flange), said, _joints(bag))
+    return Selection(
+        image, _camera(bag, image), tree.track(base, flange), said, _joints(bag, wanted.joint_topic)
+    )
 
 
 def _tree(bag: Bag, topics: list[str]) -> FrameTree:
@@ -86,7 +89,7 @@ def _tree(bag: Bag, topics: list[str]) -> FrameTree:
     for topic in topics:
         for frames in bag.values(topic):
             assert isinstance(frames, list)
-            tree.add(frames)
+            tree.add(frames, latched=topic.rpartition("/")[2] == "tf_static")
     return tree
 
 
@@ -118,32 +121,41 @@ def _camera(bag: Bag, image: BagTopic) -> CameraModel | None:
     return last.rectified if re.search("(^|[_/])rect", image.name.removeprefix(inner)) else last.raw
 
 
-def _joints(bag: Bag) -> JointTrack | None:
-    """The first topic that tells of an arm's joints."""
-    for topic in _of(bag, Kind.JOINTS):
-        names: tuple[str, ...] | None = None
-        order: tuple[int, ...] | None = None
-        stamps_ns, positions, speeds = array("q"), array("d"), array("d")
-        for value in bag.values(topic.name):
-            assert isinstance(value, JointMessage)
-            if order is None:
-                order, names = arm_joints(value.names), value.names
-            if order is None or value.names != names or len(value.positions_rad) != len(names):
-                continue
-            told_rad = [value.positions_rad[place] for place in order]
-            if not np.isfinite(told_rad).all():
-                continue
-            stamps_ns.append(value.stamp_ns)
-            positions.extend(told_rad)
-            if len(value.speeds_rad_s) == len(names):
-                speeds.extend(value.speeds_rad_s[place] for place in order)
-        if order is not None and stamps_ns:
-            by_time = np.argsort(stamps_ns, kind="stable")
-            told, moved = (np.array(values).reshape(-1, len(order)) for values in (positions, speeds))
-            track = np.array(stamps_ns)[by_time], told[by_time]
-            known = len(moved) == len(told) and bool(np.isfinite(moved).all())
-            return JointTrack(topic.name, *track, moved[by_time] if known else None)
-    return None
+def _joints(bag: Bag, name: str | None) -> JointTrack | None:
+    """The joints of the one topic that tells of an arm's. Of several nobody knows whose they are."""
+    option = "--joint-topic"
+    topics = _of(bag, Kind.JOINTS) if name is None else [_one(bag, Kind.JOINTS, name, option)]
+    tracks = [track for topic in topics if (track := _joint_track(bag, topic.name)) is not None]
+    if len(tracks) > 1:
+        there = ", ".join(track.topic for track in tracks)
+        raise ImportSourceError("several-topics", kind=Kind.JOINTS.value, there=there, option=option)
+    return tracks[0] if tracks else None
+
+
+def _joint_track(bag: Bag, topic: str) -> JointTrack | None:
+    names: tuple[str, ...] | None = None
+    order: tuple[int, ...] | None = None
+    stamps_ns, positions, speeds = array("q"), array("d"), array("d")
+    for value in bag.values(topic):
+        assert isinstance(value, JointMessage)
+        if order is None:
+            order, names = arm_joints(value.names), value.names
+        if order is None or value.names != names or len(value.positions_rad) != len(names):
+            continue
+        told_rad = [value.positions_rad[place] for place in order]
+        if not np.isfinite(told_rad).all():
+            continue
+        stamps_ns.append(value.stamp_ns)
+        positions.extend(told_rad)
+        if len(value.speeds_rad_s) == len(names):
+            speeds.extend(value.speeds_rad_s[place] for place in order)
+    if order is None or not stamps_ns:
+        return None
+    by_time = np.argsort(stamps_ns, kind="stable")
+    told, moved = (np.array(values).reshape(-1, len(order)) for values in (positions, speeds))
+    track = np.array(stamps_ns)[by_time], told[by_time]
+    known = len(moved) == len(told) and bool(np.isfinite(moved).all())
+    return JointTrack(topic, *track, moved[by_time] if known else None)
 
 
 def arm_joints(names: tuple[str, ...]) -> tuple[int, ...] | None:

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
+from recordings.errors import ImportSourceError
 from recordings.importers.bags import BagTopic
 from recordings.importers.messages import FrameMessage, ImageMessage, JointMessage, Kind, decoded
 from recordings.importers.selection import Selection, Wanted, select
+from tests.codes import raises
 from tests.recordings.test_bag_frames import frame, random_pose, turned
 
 
@@ -87,3 +89,14 @@ def test_joints_come_by_their_numbers_and_what_is_no_number_is_passed_over() -> 
     assert track.speeds_rad_s is None
     assert chosen(__joints=joints(names, (), nothing)).joints is None
     assert chosen(__joints=joints(tuple("abcde"), (1, 2, 3, 4, 5))).joints is None, "in which order?"
+
+
+def test_joints_on_several_topics_are_asked_for() -> None:
+    """Of two arms in one bag the first one's were once taken, whichever the frames were of."""
+    names = tuple("123456")
+    arms = {f"__{arm}__joints": joints(names, (at,) * 6) for arm, at in (("left", 1.0), ("right", 2.0))}
+    with raises("several-topics", ImportSourceError, option="--joint-topic"):
+        chosen(**arms)
+    track = chosen(wanted=Wanted(joint_topic="/right/joints"), **arms).joints
+    assert track is not None and track.positions_rad.tolist() == [[2.0] * 6]
+    assert chosen(**arms | {"__left__joints": joints(tuple("abcdef"), (1.0,) * 6)}).joints is not None

@@ -297,3 +297,23 @@ def test_closing_leaves_the_part_file_for_recovery(tmp_path: Path) -> None:
         recorder.event(event())
     with refused("unfinished-recording"):
         recorder.finish().result(PATIENCE_S)
+
+
+def test_what_comes_with_the_end_while_the_thread_looks_up_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread once left when the end had come since it had found nothing."""
+    look, finished = Recorder._next, []
+
+    def next_items(recorder: Recorder) -> object:
+        items = look(recorder)
+        if items == [] and not finished:
+            recorder.attach("plan.yaml", "application/yaml", b"poses: []")
+            finished.append(recorder.finish())
+        return items
+
+    monkeypatch.setattr(Recorder, "_next", next_items)
+    recorder = Recorder(tmp_path / "r.mcap", make_info())
+    wait_until(lambda: finished)
+    assert open_recording(finished[0].result(60)).attachments() == {"plan.yaml": b"poses: []"}
+    recorder.close()

@@ -13,6 +13,11 @@ from recordings.images import Pixels
 
 Grey = NDArray[np.uint8]
 
+
+class OtherBoardError(Exception):
+    """The image shows a board of the same kind with other columns or rows."""
+
+
 _WINDOW_SHARE = 0.35
 """Half window of the refinement over the local spacing: as much edge as possible, no other corner."""
 _LARGEST_HALF_WINDOW_PX = 16
@@ -50,13 +55,11 @@ def through(H: Array, points: Array) -> Array:
 
 def local_spacing(grid: Array) -> Array:
     """Measure the distance to the nearest neighbour, (rows, columns) for a grid (rows, columns, 2) px."""
-    across = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
-    down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
-    spacing = np.full(grid.shape[:2], np.inf)
-    along, below = (spacing[:, :-1], spacing[:, 1:]), (spacing[:-1], spacing[1:])
-    for shifted, steps in (*((part, across) for part in along), *((part, down) for part in below)):
-        np.minimum(shifted, steps, out=shifted)
-    return spacing
+    across, down = (
+        np.pad(np.linalg.norm(np.diff(grid, axis=axis), axis=-1), edges, constant_values=np.inf)
+        for axis, edges in ((1, ((0, 0), (1, 1))), (0, ((1, 1), (0, 0))))
+    )
+    return np.asarray(np.minimum.reduce([across[:, 1:], across[:, :-1], down[1:], down[:-1]]))
 
 
 def is_regular(grid: Array) -> bool:

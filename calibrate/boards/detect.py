@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.corners import Grey, to_grey
-from calibrate.boards.grids import count_circles, find_chessboard, find_circles, other_size
-from calibrate.boards.markers import find_april_grid, find_charuco, find_tag, misplaced
+from calibrate.boards.corners import Grey, OtherBoardError, to_grey
+from calibrate.boards.grids import find_chessboard, find_circles, other_size
+from calibrate.boards.markers import NOTHING, find_april_grid, find_charuco, find_tag
 from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
 from calibrate.geometry import Array
 from recordings.images import Pixels
@@ -75,8 +76,14 @@ def detect(image: Pixels, spec: BoardSpec, thorough: bool = True, exhaustive: bo
     check_board(spec)
     grey = to_grey(image)
     expected = len(board_points(spec))
-    indices, pixels = _find(grey, spec, thorough, exhaustive)
     height, width = grey.shape
+    try:
+        indices, pixels = _find(grey, spec, thorough, exhaustive)
+    except OtherBoardError:
+        text = f"a board like the {describe_board(spec)} is seen, with other columns or rows"
+        return Detection(
+            "other-board", text, *NOTHING, expected, width, height, _saturated(grey, NOTHING[1]), 0.0
+        )
     fewest = min(FEWEST_POINTS, expected)
     whole = len(indices) == expected
     found = whole or (len(indices) >= fewest and fixes_a_plane(board_points(spec)[indices]))
@@ -103,7 +110,7 @@ def _find(
     else:
         pixels = find_circles(grey, spec)
     if pixels is None:
-        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+        return NOTHING
     return np.arange(len(pixels)), pixels
 
 
@@ -121,16 +128,6 @@ def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool
         return "over-exposed", "the image is over-exposed: more than half of it is saturated"
     if float(grey.std()) < 3.0:
         return "empty", f"the image is empty (grey {level:.0f}, no contrast)"
-    if (
-        thorough
-        and spec.kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID)
-        and (tags := misplaced(grey, spec))
-    ):
-        return "other-board", f"{tags} of its markers are seen, placed as on a board of other columns or rows"
-    if thorough and spec.kind in (BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES):
-        circles, expected = count_circles(grey), spec.columns * spec.rows
-        if circles > expected:
-            return "other-board", f"board of {expected} circles expected, {circles} seen: another board"
     seen = other_size(grey, spec) if thorough and spec.kind is BoardKind.CHESSBOARD else None
     if seen is None or sorted(seen) == sorted((spec.columns, spec.rows)):
         return "not-found", f"no {describe_board(spec)} found"
@@ -144,8 +141,10 @@ def _seen_in_a_mirror(grey: Grey, spec: BoardSpec) -> bool:
     """Only markers tell: a chessboard looks right in a mirror."""
     if spec.kind not in (BoardKind.CHARUCO, BoardKind.APRIL_GRID, *SINGLE_TAGS):
         return False
-    indices, _ = _find(np.ascontiguousarray(grey[:, ::-1]), spec, thorough=False)
-    return len(indices) >= min(FEWEST_POINTS, len(board_points(spec)))
+    with suppress(OtherBoardError):
+        indices, _ = _find(np.ascontiguousarray(grey[:, ::-1]), spec, thorough=False)
+        return len(indices) >= min(FEWEST_POINTS, len(board_points(spec)))
+    return False
 
 
 def _saturated(grey: Grey, pixels: Array) -> float:

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from calibrate.boards.corners import (
     Grey,
+    OtherBoardError,
     alternation,
     contrasts,
     equalise,
@@ -229,8 +230,10 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
                     if group is not None:
                         seen = group[np.linalg.norm(seen[:, None] - group, axis=2).argmin(axis=1)]
                     ordered = _best_order(seen, spec)
-                    if ordered is None or not _is_even(ordered, spec) or _goes_on(image, ordered, spec):
+                    if ordered is None or not _is_even(ordered, spec):
                         return None
+                    if _goes_on(image, ordered, spec):
+                        raise OtherBoardError
                     return true_centres(grey, ordered, spec)
     return None
 

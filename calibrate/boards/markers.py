@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.corners import Grey, equalise, local_spacing, refine, sample, through
+from calibrate.boards.corners import Grey, OtherBoardError, equalise, local_spacing, refine, sample, through
 from calibrate.boards.model import board_points, dictionary_id, tag_dictionary
 from calibrate.geometry import Array
 from recordings.schema.messages import BoardKind, BoardSpec
@@ -22,10 +22,8 @@ _SMALL_MARKER_PX, _ENLARGED, _LARGEST_SIDE_PX = 20.0, 3.0, 6000
 _SMALLEST_PERIMETER = 0.03
 """Perimeter of a marker over the longer side of the image; OpenCV's own."""
 _ASTRAY, _MOST = 0.25, 0.75
-_TELLING = 4
 """Farther than this share of its side from where the board has it, a marker does not lie as printed; share of
-the markers that must. Of a board in the legacy order half of them do. As many seen tell another
-board."""
+the markers that must. Of a board in the legacy order half of them do."""
 _NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
 """A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
 and than so many times the middle one."""
@@ -74,7 +72,7 @@ def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[In
     # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
     points = board_points(spec)[:, :2] + spec.square_m  # OpenCV counts from the outer edge
     kept = plane[lies].reshape(-1, 2), pixels[lies].reshape(-1, 2)
-    return _snap_to_corners(grey, spec, H, *kept, points) if lies.any() else NOTHING
+    return _snap_to_corners(grey, spec, H, *kept, points)
 
 
 def _seen(detector: Any, image: Any, known: Collection[int]) -> dict[int, Array]:
@@ -96,14 +94,16 @@ def _side_px(markers: Array) -> float:
 def _as_printed(plane: Array, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Find the homography from the board and which markers (n, 4, 2) lie where it has them.
 
-    A few may be misread, or not on the board. None does where more are: that board has other columns or rows.
+    A few may be misread, or not on the board. Raises OtherBoardError where more are.
     """
     limit_px = _ASTRAY * _side_px(pixels)
     found: Any = cv2.findHomography(plane.reshape(-1, 2), pixels.reshape(-1, 2), cv2.RANSAC, limit_px)
     H = np.full((3, 3), np.nan) if found[0] is None else found[0]
     shown = through(H, plane.reshape(-1, 2)).reshape(pixels.shape)
     lies = np.linalg.norm(shown - pixels, axis=2).max(axis=1) < limit_px
-    return H, lies & (lies.mean() >= _MOST)
+    if lies.mean() < _MOST:
+        raise OtherBoardError
+    return H, lies
 
 
 def _snap_to_corners(
@@ -177,8 +177,6 @@ def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
         return NOTHING
     printed, tags, pixels = _printed(spec), np.array(list(seen)), np.array(list(seen.values()))
     _, lies = _as_printed(np.array([printed[i] for i in seen]), pixels)
-    if not lies.any():
-        return NOTHING
     tags, pixels = tags[lies], pixels[lies]
     sides = np.repeat(np.linalg.norm(np.diff(pixels, axis=1), axis=2).min(axis=1), 4)
     gap_share = (spec.marker_m or spec.square_m) / spec.square_m
@@ -191,15 +189,6 @@ def _at_a_glance(grey: Grey, spec: BoardSpec) -> dict[int, Array]:
     borders = (2, 1) if spec.kind is BoardKind.APRIL_GRID else (1,)
     detectors = (marker_detector(tag_dictionary(spec), border_bits) for border_bits in borders)
     return max((_seen(detector, grey, _printed(spec)) for detector in detectors), key=len)
-
-
-def misplaced(grey: Grey, spec: BoardSpec) -> int:
-    """Count the board's markers that are seen where they lie otherwise than on this board."""
-    seen, printed = _at_a_glance(grey, spec), _printed(spec)
-    if len(seen) < _TELLING:
-        return 0
-    _, lies = _as_printed(np.array([printed[i] for i in seen]), np.array(list(seen.values())))
-    return 0 if lies.any() else len(seen)
 
 
 _ROW_BY_ROW = [0, 1, 3, 2]

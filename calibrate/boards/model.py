@@ -160,18 +160,9 @@ def board_from_turned(spec: BoardSpec, quarters: int) -> Array:
 
 def fixes_a_plane(points: Array) -> bool:
     """Tell whether points of a board (n, 3) fix its plane: not where all but one lie in a line."""
-    xy = points[:, :2] - points[:, :2].mean(axis=0)
-    xy = xy / max(float(np.abs(xy).max()), 1e-12)
-    x, y, one = xy[:, 0], xy[:, 1], np.ones(len(xy))
-    zero = np.zeros_like(one)
-    by_homography = np.concatenate(
-        [
-            np.stack([x, y, one, zero, zero, zero, -x * x, -x * y, -x], axis=1),
-            np.stack([zero, zero, zero, x, y, one, -x * y, -y * y, -y], axis=1),
-        ]
-    )
-    singular = np.linalg.svd(by_homography, compute_uv=False)
-    return len(singular) > 7 and bool(singular[7] > 1e-6 * singular[0])
+    rest = np.array([np.delete(points[:, :2], k, axis=0) for k in range(len(points))])
+    spread = np.linalg.svd(rest - rest.mean(axis=1, keepdims=True), compute_uv=False)
+    return len(points) > 3 and bool((spread[:, 1] > 1e-6 * spread[:, 0]).all())
 
 
 def ambiguity_text(spec: BoardSpec) -> str:

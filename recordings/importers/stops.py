@@ -148,6 +148,5 @@ def _stillness(
 
 
 def _same(a: Array, b: Array) -> bool:
-    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
-    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < NEW_STOP_M
-    return bool(near and np.arccos(np.clip(cosine, -1, 1)) < NEW_STOP_RAD)
+    from_middle_m, angle_rad = scatter(np.array([a, b]))
+    return 2 * from_middle_m < NEW_STOP_M and angle_rad < NEW_STOP_RAD

@@ -33,17 +33,6 @@ EVIL = ["../../etc/x", "/etc/passwd", "a\0b", "x" * 300, "", "..", ".", "a/b", "
 NEW = b"new" * 1000
 
 
-def test_the_name_is_there_only_after_finish(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with RecordingWriter(path, make_info()) as writer:
-        writer.image(make_picture(0))
-        assert not path.exists()
-        assert writer.part_path.stat().st_size > 0
-        writer.finish()
-    assert path.exists()
-    assert not writer.part_path.exists()
-
-
 def test_content_name_and_folder_reach_the_disk_in_this_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

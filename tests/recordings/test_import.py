@@ -258,14 +258,6 @@ def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -
     assert json.loads(result.stdout) == {"recording": str(output), "views": 3, "bytes": output.stat().st_size}
 
 
-def test_an_existing_output_is_not_touched(folder: Path, tmp_path: Path) -> None:
-    output = tmp_path / "out.mcap"
-    output.write_text("precious")
-    with refused("exists"):
-        import_folder(folder, output)
-    assert output.read_text() == "precious"
-
-
 SOLVED = {
     "ur5-chessboard", "charuco-eye-to-hand", "denso-long", "six-views", "rendered-truth",
     "rendered-truth-eye-to-hand",

@@ -36,8 +36,6 @@ class RobotStatesInfo(msgspec.Struct, frozen=True):
     rate_hz: float | None
     gaps: int
     largest_gap_s: float
-    backward: int
-    """Times that the controller's clock goes back."""
 
 
 class RecordingInfo(msgspec.Struct, frozen=True):
@@ -125,7 +123,6 @@ def _robot_states(recording: Recording) -> RobotStatesInfo | None:
         rate_hz=1 / period_s if period_s > 0 else None,
         gaps=len(gaps_s),
         largest_gap_s=float(gaps_s.max(initial=0.0)),
-        backward=int((steps_s < 0).sum()),
     )
 
 

@@ -13,11 +13,6 @@ from recordings.images import Pixels
 
 Grey = NDArray[np.uint8]
 
-
-class OtherBoardError(Exception):
-    """The image shows a board of the same kind with other columns or rows."""
-
-
 _WINDOW_SHARE = 0.35
 """Half window of the refinement over the local spacing: as much edge as possible, no other corner."""
 _LARGEST_HALF_WINDOW_PX = 16

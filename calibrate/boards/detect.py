@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.corners import Grey, OtherBoardError, to_grey
+from calibrate.boards.corners import Grey, to_grey
 from calibrate.boards.grids import find_chessboard, find_circles, other_size
 from calibrate.boards.markers import NOTHING, find_april_grid, find_charuco, find_tag
 from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
@@ -77,13 +76,7 @@ def detect(image: Pixels, spec: BoardSpec, thorough: bool = True, exhaustive: bo
     grey = to_grey(image)
     expected = len(board_points(spec))
     height, width = grey.shape
-    try:
-        indices, pixels = _find(grey, spec, thorough, exhaustive)
-    except OtherBoardError:
-        text = f"a board like the {describe_board(spec)} is seen, with other columns or rows"
-        return Detection(
-            "other-board", text, *NOTHING, expected, width, height, _saturated(grey, NOTHING[1]), 0.0
-        )
+    indices, pixels = _find(grey, spec, thorough, exhaustive)
     fewest = min(FEWEST_POINTS, expected)
     whole = len(indices) == expected
     found = whole or (len(indices) >= fewest and fixes_a_plane(board_points(spec)[indices]))
@@ -141,10 +134,8 @@ def _seen_in_a_mirror(grey: Grey, spec: BoardSpec) -> bool:
     """Only markers tell: a chessboard looks right in a mirror."""
     if spec.kind not in (BoardKind.CHARUCO, BoardKind.APRIL_GRID, *SINGLE_TAGS):
         return False
-    with suppress(OtherBoardError):
-        indices, _ = _find(np.ascontiguousarray(grey[:, ::-1]), spec, thorough=False)
-        return len(indices) >= min(FEWEST_POINTS, len(board_points(spec)))
-    return False
+    indices, _ = _find(np.ascontiguousarray(grey[:, ::-1]), spec, thorough=False)
+    return len(indices) >= min(FEWEST_POINTS, len(board_points(spec)))
 
 
 def _saturated(grey: Grey, pixels: Array) -> float:

@@ -19,7 +19,6 @@ from scipy.spatial import KDTree
 
 from calibrate.boards.corners import (
     Grey,
-    OtherBoardError,
     alternation,
     contrasts,
     equalise,
@@ -62,7 +61,7 @@ def find_chessboard(
         flat = refine(grey, grid.reshape(-1, 2), spacing.ravel())
         grid = flat.reshape(grid.shape)
         if is_regular(grid) and abs(alternation(square_greys(grey, grid))) > _ALTERNATE:
-            if _goes_on(grey, grid, spec):
+            if _goes_on(grey, grid):
                 return None
             return _orient(grey, grid, spec).reshape(-1, 2)
     return None
@@ -114,36 +113,19 @@ def _orient(grey: Grey, grid: Array, spec: BoardSpec) -> Array:
     return min((np.rot90(grid, t) for t in dark_first), key=lambda c: float(c[0, 0].sum()))
 
 
-def _goes_on(grey: Grey, grid: Array, spec: BoardSpec) -> bool:
-    """Tell whether the pattern goes on beyond a side of the grid: it is a part of a larger board's."""
-    j, i = np.meshgrid(np.arange(-2.0, spec.columns + 2), np.arange(-2.0, spec.rows + 2))
-    asymmetric = spec.kind is BoardKind.ASYMMETRIC_CIRCLES
-    plane = np.stack([2 * j + i % 2 if asymmetric else j, i], axis=-1)
+def _goes_on(grey: Grey, grid: Array) -> bool:
+    """Tell whether the squares go on beyond a side of the grid: it is a part of a larger board's."""
+    rows, columns = grid.shape[:2]
+    plane = np.stack(np.meshgrid(np.arange(-2.0, columns + 2), np.arange(-2.0, rows + 2)), axis=-1)
     found: Any = cv2.findHomography(plane[2:-2, 2:-2].reshape(-1, 2), grid.reshape(-1, 2), 0)
-    H, last = found[0], np.array(grey.shape[::-1]) - 1
-    chessboard = spec.kind is BoardKind.CHESSBOARD
-    blobs = () if chessboard else _blobs(grey.size / len(grid)).detect(grey)
-    at, size = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
-    if H is None or not (chessboard or len(blobs)):
-        return False
+    last = np.array(grey.shape[::-1]) - 1
     for turn in range(4):
-        beyond = np.rot90(plane, turn)[0 if chessboard else 1 : 3, 2:-2]  # the last row is the grid's own
-        pixels = through(H, beyond.reshape(-1, 2)).reshape(beyond.shape)
-        if ((pixels < 0) | (pixels > last)).any():
-            continue
-        if chessboard:
+        beyond = np.rot90(plane, turn)[:3, 2:-2]  # the last of these rows is the grid's own
+        pixels = through(found[0], beyond.reshape(-1, 2)).reshape(beyond.shape)
+        if not ((pixels < 0) | (pixels > last)).any():
             next_squares, outermost = np.moveaxis(contrasts(square_greys(grey, pixels))[1].mean(axis=2), 1, 0)
-            goes_on = bool((next_squares * outermost.mean() > 0.5 * outermost.mean() ** 2).all())
-        else:
-            own = float(np.median(size[KDTree(at).query(pixels[1])[1]]))
-            alike = (size > own / _AS_LARGE) & (size < own * _AS_LARGE)
-            away_px, step_px = (
-                KDTree(at[alike]).query(pixels[0])[0],
-                np.linalg.norm(pixels[1] - pixels[0], axis=1),
-            )
-            goes_on = bool((away_px < _NEXT * step_px).mean() > 0.5)
-        if goes_on:
-            return True
+            if (next_squares * outermost.mean() > 0.5 * outermost.mean() ** 2).all():
+                return True
     return False
 
 
@@ -174,8 +156,6 @@ _AS_LARGE = 1.4
 """Circles of one grid differ by less than this factor in size, unless seen from very near."""
 _TOGETHER = 2.5
 """Neighbours of one grid are nearer than so many of its circles' widths."""
-_NEXT = 0.3
-"""A circle nearer than this share of a step to where the grid would go on continues it."""
 _GUESSED_PX = 1.5
 """Farther than this from the middle of the ink a centre was guessed, not found."""
 
@@ -215,7 +195,7 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
     count = spec.columns * spec.rows
-    for image in (grey, np.asarray(cv2.bitwise_not(grey), np.uint8)):
+    for image in (grey, cv2.bitwise_not(grey)):
         groups = (each for each in _together(image, grey.size / count) if count <= len(each) < 2 * count)
         for group in chain(groups, [None]):  # OpenCV loses a grid among other blobs
             for clustering in (0, cv2.CALIB_CB_CLUSTERING):
@@ -232,8 +212,6 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
                     ordered = _best_order(seen, spec)
                     if ordered is None or not _is_even(ordered, spec):
                         return None
-                    if _goes_on(image, ordered, spec):
-                        raise OtherBoardError
                     return true_centres(grey, ordered, spec)
     return None
 

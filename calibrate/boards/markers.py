@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.corners import Grey, OtherBoardError, equalise, local_spacing, refine, sample, through
+from calibrate.boards.corners import Grey, equalise, local_spacing, refine, sample, through
 from calibrate.boards.model import board_points, dictionary_id, tag_dictionary
 from calibrate.geometry import Array
 from recordings.schema.messages import BoardKind, BoardSpec
@@ -65,14 +65,13 @@ def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[In
         detector = marker_detector(spec.dictionary or "", 1, _SMALLEST_PERIMETER / _ENLARGED)
         enlarged = _seen(detector, large, printed)
         seen = max(seen, {i: (marker + 0.5) / _ENLARGED - 0.5 for i, marker in enlarged.items()}, key=len)
-    if len(seen) < 2:
+    if len(seen) < 2 or (found := _as_printed(printed, seen)) is None:
         return NOTHING
-    plane, pixels = np.array([printed[i] for i in seen]), np.array(list(seen.values()))
-    H, lies = _as_printed(plane, pixels)
     # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
     points = board_points(spec)[:, :2] + spec.square_m  # OpenCV counts from the outer edge
-    kept = plane[lies].reshape(-1, 2), pixels[lies].reshape(-1, 2)
-    return _snap_to_corners(grey, spec, H, *kept, points)
+    H, tags = found
+    plane, pixels = (np.concatenate([each[i] for i in tags]) for each in (printed, seen))
+    return _snap_to_corners(grey, spec, H, plane, pixels, points)
 
 
 def _seen(detector: Any, image: Any, known: Collection[int]) -> dict[int, Array]:
@@ -91,19 +90,19 @@ def _side_px(markers: Array) -> float:
     return float(np.median(np.linalg.norm(np.diff(markers, axis=1), axis=2)))
 
 
-def _as_printed(plane: Array, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Find the homography from the board and which markers (n, 4, 2) lie where it has them.
+def _as_printed(printed: dict[int, Array], seen: dict[int, Array]) -> tuple[Array, NDArray[np.intp]] | None:
+    """(homography from the board, numbers of the markers that lie where it has them).
 
-    A few may be misread, or not on the board. Raises OtherBoardError where more are.
+    A few may be misread, or not on the board. None where more are: it has other columns or rows.
     """
+    plane, pixels = np.array([printed[i] for i in seen]), np.array(list(seen.values()))
     limit_px = _ASTRAY * _side_px(pixels)
     found: Any = cv2.findHomography(plane.reshape(-1, 2), pixels.reshape(-1, 2), cv2.RANSAC, limit_px)
-    H = np.full((3, 3), np.nan) if found[0] is None else found[0]
+    if (H := found[0]) is None:
+        return None
     shown = through(H, plane.reshape(-1, 2)).reshape(pixels.shape)
     lies = np.linalg.norm(shown - pixels, axis=2).max(axis=1) < limit_px
-    if lies.mean() < _MOST:
-        raise OtherBoardError
-    return H, lies
+    return (H, np.array(list(seen))[lies]) if lies.mean() >= _MOST else None
 
 
 def _snap_to_corners(
@@ -173,11 +172,10 @@ def marker_detector(
 def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
     """Find four corners of every tag. Printed borders of one and of two bits (Kalibr) are tried."""
     seen = _at_a_glance(grey, spec)
-    if not seen:
+    if not seen or (found := _as_printed(_printed(spec), seen)) is None:
         return NOTHING
-    printed, tags, pixels = _printed(spec), np.array(list(seen)), np.array(list(seen.values()))
-    _, lies = _as_printed(np.array([printed[i] for i in seen]), pixels)
-    tags, pixels = tags[lies], pixels[lies]
+    tags = found[1]
+    pixels = np.array([seen[i] for i in tags])
     sides = np.repeat(np.linalg.norm(np.diff(pixels, axis=1), axis=2).min(axis=1), 4)
     gap_share = (spec.marker_m or spec.square_m) / spec.square_m
     refined = refine(grey, pixels[:, ::-1].reshape(-1, 2), sides * min(1.0, gap_share))

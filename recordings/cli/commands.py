@@ -116,8 +116,7 @@ def _info_rows(facts: RecordingInfo) -> Iterator[tuple[str, str]]:
     if states := facts.robot_states:
         rate = f"{states.rate_hz:.1f} Hz" if states.rate_hz else "a controller time that does not go on"
         gaps = f"gaps: {states.gaps}, largest {states.largest_gap_s * 1e3:.0f} ms"
-        back = f", controller time goes back: {states.backward}" if states.backward else ""
-        yield "robot states", f"{states.count} at {rate}, {gaps}{back}"
+        yield "robot states", f"{states.count} at {rate}, {gaps}"
     yield "images", str(facts.images)
     for source, bound_s in facts.time_bounds_s.items():
         yield "image time", f"by {source}, within {1000 * bound_s:.2f} ms of mid-exposure"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import stat
 import subprocess
@@ -26,7 +25,7 @@ from recordings.files import (
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
 from tests.durability import disk_order, full
-from tests.recordings.small_recording import make_info, make_picture, refused, write_small
+from tests.recordings.small_recording import make_info, make_picture, refused
 
 EVIL = ["../../etc/x", "/etc/passwd", "a\0b", "x" * 300, "", "..", ".", "a/b", "Ä", "a..b", "A", "a\n"]
 
@@ -95,11 +94,6 @@ def test_evil_names_are_refused(tmp_path: Path, name: str) -> None:
 def test_any_text_gives_a_safe_session_name_and_no_attachment_leaves_its_folder(text: str) -> None:
     assert is_session_name(session_name_from(text))
     assert not is_attachment_name(text) or os.path.normpath(f"/folder/{text}") == f"/folder/{text}"
-
-
-def test_a_missing_folder_says_so(tmp_path: Path) -> None:
-    with refused("disk", errno=errno.ENOENT):
-        write_small(tmp_path / "no" / "a.mcap")
 
 
 def test_free_space_below_the_reserve_is_refused_with_the_amount(tmp_path: Path) -> None:

@@ -258,24 +258,6 @@ def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -
     assert json.loads(result.stdout) == {"recording": str(output), "views": 3, "bytes": output.stat().st_size}
 
 
-SOLVED = {
-    "ur5-chessboard", "charuco-eye-to-hand", "denso-long", "six-views", "rendered-truth",
-    "rendered-truth-eye-to-hand",
-}  # fmt: skip
-
-
-def test_every_real_dataset_imports(datasets: Path, tmp_path: Path) -> None:
-    """But for those that tests/calibrate/test_job.py imports and solves."""
-    folders = {path.parent for path in datasets.glob("*/dataset.yaml") if path.parent.name not in SOLVED}
-    assert folders
-    for source in folders:
-        done = import_folder(source, tmp_path / f"{source.name}.mcap")
-        recording = open_recording(done.path)
-        camera = recording.info.camera
-        assert len(recording.views()) == done.images == len((source / "poses.csv").read_text().split()) - 1
-        assert recording.image(recording.views()[0]).pixels.shape[:2] == (camera.height, camera.width)
-
-
 DOCUMENT = Path(__file__).parent.parent.parent / "docs/integrator/import.md"
 
 

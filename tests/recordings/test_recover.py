@@ -200,8 +200,9 @@ def test_a_folder_with_parts_of_two_sessions_is_recovered_but_nothing_is_given_u
 
 
 def test_an_empty_folder_and_a_name_that_is_no_recordings_are_said(tmp_path: Path) -> None:
-    with refused("no-recording"):
-        recover_recording(tmp_path)
+    for read in (open_recording, recover_recording):
+        with refused("no-recording"):
+            read(tmp_path)
     part = write_unfinished(tmp_path / "a.mcap")
     with refused("recording-name"):
         recover_recording(part, tmp_path / "b.bag")

@@ -86,8 +86,3 @@ def test_parts_of_different_sessions_do_not_mix(tmp_path: Path, changes: dict[st
     write_part(tmp_path / "session-2.mcap", [(1, 1)], part=2, **changes)
     with refused("several-sessions"):
         open_recording(tmp_path)
-
-
-def test_an_empty_folder_says_so(tmp_path: Path) -> None:
-    with refused("no-recording"):
-        open_recording(tmp_path)

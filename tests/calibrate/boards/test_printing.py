@@ -38,11 +38,14 @@ def page_mm(content: bytes) -> tuple[float, float]:
     return float(box[1]) / 72 * 25.4, float(box[2]) / 72 * 25.4
 
 
-def test_a_tag_that_is_seen_on_two_boards_is_read_on_neither() -> None:
-    """Its corners would be in two places at once, and the board's pose anywhere."""
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_tag_that_is_seen_on_two_boards_is_read_on_neither(hidden: bool) -> None:
+    """Its corners would be in two places at once, and the board's pose anywhere; also where one is hidden."""
     spec = next(board for board in BOARDS if board.kind is BoardKind.APRIL_GRID)
     sheet = printed(board_sheet(spec))
-    first_column = sheet[:, : sheet.shape[1] // 4 + 10]
+    first_column = sheet[:, : sheet.shape[1] // 4 + 10].copy()
+    if hidden:
+        sheet[:, : sheet.shape[1] // 4] = 255
     found = detect(np.concatenate([sheet, first_column], axis=1), spec)
     assert sorted(found.indices.tolist()) == [i for i in range(48) if i // 4 % spec.columns]
 

@@ -34,9 +34,10 @@ def process(pid: int) -> Process | None:
         place = Path(f"/proc/{pid}")
         user = place.stat().st_uid
         # proc(5), after the name: state, ppid, pgrp, session, tty_nr, tpgid, …, starttime
-        words = (place / "stat").read_text().rpartition(")")[2].split()
+        # A program's name may be cut within a letter.
+        words = (place / "stat").read_text(errors="replace").rpartition(")")[2].split()
         parent, group, terminal, foreground, began = (int(words[i]) for i in (1, 2, 4, 5, 19))
-    except (OSError, IndexError):  # STOP never waits for a name
+    except (OSError, ValueError, IndexError):  # STOP never waits for a name
         return None
     shown = terminal != 0 and group == foreground
     return Process(user, began, _terminal_name(terminal) if shown else "", parent)

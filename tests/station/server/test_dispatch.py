@@ -266,6 +266,7 @@ async def test_watchers_are_not_told_the_token(served: Served, small_plan: Plan)
 def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
     program = (
         "import os, signal, sys\nfrom station.server.approval import process\n"
+        "open('/proc/self/comm', 'wb').write(b'pr\\xc3')\n"  # the kernel cuts a name, also within a letter
         "print(process(os.getpid()).terminal == os.ttyname(0)[len('/dev/'):], flush=True)\n"
         "signal.signal(signal.SIGTTOU, signal.SIG_IGN)\nif os.fork() == 0:\n"
         "    os.setpgid(0, 0)\n    print('<' + process(os.getpid()).terminal + '>', flush=True)\n"

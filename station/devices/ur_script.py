@@ -4,8 +4,8 @@ The script is uploaded once. Every RTDE data packet carries everything: sequence
 speed, acceleration. A verb is carried out once, when its sequence is new; the script answers with that
 sequence, negative if it refuses. Once armed, the script ends when the keepalive does not change for 0.2 s: it
 kills the thread that moves, brakes and halts, as Universal Robots' own library does. It ends the same way for
-any other reason. One that nobody arms ends after 20 s. A lost connection is never reopened, and the script
-ends with it.
+any other reason. One that nobody arms ends 20 s after the last keepalive or command. A lost connection is
+never reopened, and the script ends with it.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def station_control():
     sequence = read_input_integer_register({r})
     verb = read_input_integer_register({r} + 1)
     alive = read_input_integer_register({r} + 2)
-    if alive != kept:
+    if (alive != kept) or ((not armed) and (sequence != seen)):
       kept = alive
       silence = 0.0
     else:

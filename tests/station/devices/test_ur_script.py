@@ -118,6 +118,16 @@ def test_nothing_moves_at_the_start_and_a_script_that_nobody_arms_ends() -> None
     assert not made.plays and made.robot.arm.command == HOME
 
 
+def test_a_script_that_is_armed_late_waits_for_its_first_keepalive() -> None:
+    made = Registers()
+    made.run(3.0, kick=False)
+    made.sequence, made.verb = made.sequence + 1, Command.ARM
+    made.run(0.19, kick=False)
+    assert made.plays and made.state is State.ARMED
+    made.run(0.03, kick=False)
+    assert not made.plays
+
+
 @pytest.mark.parametrize("verb", [Command.NONE, Command.ARM, Command.MOVE])
 def test_registers_that_somebody_else_left_are_not_obeyed(verb: Command) -> None:
     made = Registers(left_by_others=77, verb=verb)

@@ -12,11 +12,7 @@ import numpy as np
 from recordings.errors import RecordingError
 from recordings.schema.messages import Vector6
 from station.cell.config import vector6
-from station.cell.errors import (
-    LimitError,
-    SafetyStopError,
-    StationError,
-)
+from station.cell.errors import LimitError, SafetyStopError, StationError
 from station.cell.layout import cell_geometry
 from station.cell.limits import check_path, with_plan_speeds
 from station.cell.status import Event, StationState

@@ -54,7 +54,7 @@ STOP_WAIT_S = 1.0
 """Longest time that the answer to STOP, sent after the arm was stopped, waits for data being written."""
 PLAN_TIMEOUT_S = 180.0
 BEGIN_AGAIN_S = 0.2
-"""Pause after a defect in a task of the daemon, so that one that stays does not fill log and loop."""
+"""Pause after a defect in a task of the daemon, so that one that stays does not fill the loop."""
 
 
 class Session:
@@ -97,13 +97,15 @@ class Session:
 
     async def kept_going(self, loop: Callable[[], Awaitable[object]]) -> None:
         """Run a task of the daemon's life; a defect in it ends in fault, then it begins again."""
+        told = ""
         while True:
             try:
                 await loop()
                 return
             except Exception as error:
-                log.exception("a task of the daemon failed")
-                defect = StationError("internal", error=repr(error))
+                if told != (told := repr(error)):  # one that stays fills no log
+                    log.exception("a task of the daemon failed")
+                defect = StationError("internal", error=told)
                 if self.store.state not in LATCHED:
                     with contextlib.suppress(Exception):  # the heartbeat must go on, whatever else fails
                         await self._halt(StationState.FAULT, defect.text, defect.code)

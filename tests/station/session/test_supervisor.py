@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -61,10 +62,9 @@ async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) 
 
 @pytest.mark.parametrize("place", ["first", "ticked", "_watch_link"])
 async def test_a_defect_in_the_heartbeats_loop_stops_the_arm_in_fault_and_the_loop_goes_on(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch, place: str
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, place: str
 ) -> None:
-    def broken() -> None:
-        raise ZeroDivisionError
+    broken = Mock(side_effect=ZeroDivisionError)
 
     monkeypatch.setattr("station.session.session.BEGIN_AGAIN_S", 0.01)
     await rig.go_until_it_moves()
@@ -72,7 +72,8 @@ async def test_a_defect_in_the_heartbeats_loop_stops_the_arm_in_fault_and_the_lo
         patch.setattr(rig.session.supervisor, place, broken)
         await rig.until(S.FAULT)
         assert rig.cause == "internal" and rig.told("internal")
-        await until(lambda: "stop" in rig.arm.log)
+        await until(lambda: "stop" in rig.arm.log and broken.call_count > 5)
+    assert sum(record.exc_info is not None for record in caplog.records) == 1, "one that stays fills no log"
     await rig.session.acknowledge("anna")
     rig.arm.beats, rig.arm.slow = 0, False
     await rig.go_until(S.IDLE, purpose=Purpose.RESUME)

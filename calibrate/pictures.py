@@ -103,7 +103,7 @@ def _seen(given: ArrayLike | None, board: BoardSpec) -> _Seen:
     points = board_points(board)
     if given is None:
         return _Seen(points[:0], np.zeros((0, 2)), "no picture given")
-    image = np.asarray(given)
+    image = np.asanyarray(given)  # a masked array stays one
     if image.ndim == 2 and image.shape[1] == 2:
         return _Seen(points, array_of(image, (len(points), 2), "corners"))
     plain = image.ndim in (2, 3) and image.size and image.shape[2:] in ((), (3,), (4,))

@@ -18,9 +18,9 @@ _NOMINAL_MATRIX = ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0))
 
 
 def array_of(values: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
-    """Copy numbers of this shape, -1: any length. BadViewsError (`shape`) says what was given."""
+    """Copy numbers of this shape, -1: any length; masked: NaN. BadViewsError (`shape`) says what is wrong."""
     try:
-        found = np.array(values, dtype=float)
+        found: Array = np.ma.filled(np.ma.array(values, dtype=float, copy=True), np.nan)
     except (TypeError, ValueError):
         found = np.zeros(())
     if not found.size:

@@ -138,7 +138,7 @@ def other_size(grey: Grey, spec: BoardSpec) -> tuple[int, int] | None:
     if seen is None or min(spec.columns, spec.rows) <= FEWEST_ON_A_SIDE:
         return seen
     smaller = msgspec.structs.replace(spec, columns=spec.columns - 1, rows=spec.rows - 1)
-    found = find_chessboard(grey, smaller) is not None
+    found = sum(seen) < spec.columns + spec.rows and find_chessboard(grey, smaller) is not None
     return (smaller.columns, smaller.rows) if found else seen
 
 

@@ -88,8 +88,10 @@ def test_robot_states_as_arrays_are_interpolated_to_the_images() -> None:
     np.testing.assert_allclose(joints, [view.joints_rad for view in views], atol=1e-4)
 
 
-def test_views_do_not_change_with_the_callers_arrays() -> None:
+def test_views_do_not_change_with_the_callers_arrays_and_take_what_is_masked_for_no_number() -> None:
     flanges = np.array([np.eye(4)] * 2)
+    masked = ViewSet.from_poses("eye-in-hand", np.ma.masked_equal(flanges, 1), flanges)
+    assert np.isnan(masked.base_from_flange).sum() == 8
     views = ViewSet.from_poses("eye-in-hand", flanges, flanges)
     flanges[:] = 0.0
     np.testing.assert_array_equal(views.base_from_flange, [np.eye(4)] * 2)

@@ -11,7 +11,6 @@ import pytest
 from recordings.manifest import MANIFEST_FILE, Manifest, enter_part, read_manifest
 from recordings.reader import open_recording
 from recordings.recover import recover_recording
-from recordings.schema.messages import SessionInfo
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import make_info, refused, write_small
 
@@ -151,8 +150,7 @@ def test_a_folder_belongs_to_one_session(session: Path) -> None:
 
 
 def test_a_part_number_is_bounded(tmp_path: Path) -> None:
-    info: SessionInfo = make_info(part=1_000_000_000)
-    with RecordingWriter(tmp_path / "a.mcap", info) as writer:
+    with RecordingWriter(tmp_path / "a.mcap", make_info(part=1_000_000_000)) as writer:
         writer.finish()
     with refused("contradiction"):
         open_recording(tmp_path / "a.mcap")

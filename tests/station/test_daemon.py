@@ -8,7 +8,6 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from itertools import chain, repeat
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -53,10 +52,15 @@ async def test_a_defect_in_what_tells_the_screens_is_a_fault_and_they_are_told(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("station.session.session.BEGIN_AGAIN_S", 0.01)
-    publish = Mock(side_effect=chain([ZeroDivisionError("a defect")], repeat(None)))
+    publish = Mock(side_effect=ZeroDivisionError("a defect"))
     monkeypatch.setattr(daemon._client_server, "publish", publish)
+    served_s = daemon._served_s
     running = asyncio.create_task(daemon.run())
+    await until(lambda: publish.call_count > 3)
+    assert daemon._served_s == served_s, "systemd ends a daemon in which the defect stays"
+    publish.side_effect = None
     await until(lambda: any(told.args[0].state is StationState.FAULT for told in publish.call_args_list))
+    await until(lambda: daemon._served_s > served_s)
     daemon.end()
     await running
 

@@ -54,7 +54,10 @@ def test_an_approval_is_of_the_plan_in_this_cell() -> None:
         {"limits": msgspec.structs.replace(limits, speed_m_s=0.1)},
         {"limits": msgspec.structs.replace(limits, solids=(Capsule("tool", (0, 0, 0), (0, 0, 0.2), 0.05),))},
         {"board_guess": msgspec.structs.replace(config.board_guess, translation_m=(0.1, 0.2, 0.3))},
+        {"camera_guess": msgspec.structs.replace(config.camera_guess, translation_m=(0.1, 0.2, 0.3))},
+        {"mount": "eye-to-hand"},
         {"board": msgspec.structs.replace(config.board, square_m=0.03)},
+        {"robot": msgspec.structs.replace(robot, model="UR10e")},
         {"robot": msgspec.structs.replace(robot, serial="20195501234")},
         {"robot": msgspec.structs.replace(robot, kinematics=KinematicsDeltas(a_m=(0.001,) * 6))},
     ]

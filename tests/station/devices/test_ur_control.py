@@ -251,7 +251,7 @@ async def test_a_start_that_is_refused_keeps_its_code_and_its_words(parent: Pare
         await parent.child.ready(timeout_s=PATIENCE_S)
     assert caught.value.text.startswith(told.text)
     assert (caught.value.remedy, caught.value.values) == (told.remedy, told.values)
-    assert parent.process.kills
+    assert parent.process.kills and not parent.child.started_s, "its program may still start"
 
 
 @pytest.mark.parametrize(

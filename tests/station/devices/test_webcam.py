@@ -70,6 +70,16 @@ async def test_exposure_is_set_and_focus_held(camera: Webcam, controls: dict[int
     await made.close()
 
 
+async def test_a_long_exposure_is_waited_for(
+    camera: Webcam, controls: dict[int, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webcam, "_GLIMPSE_S", 0.9)
+    made = camera(exposure_us=1e6)
+    await made.open()
+    assert (await made.glimpse()).exposure_us == 1e6
+    await made.close()
+
+
 @pytest.mark.parametrize("mode", [0.0, 3.0])
 async def test_an_exposure_that_stays_automatic_is_not_told_as_one(
     camera: Webcam, controls: dict[int, float], monkeypatch: pytest.MonkeyPatch, mode: float

@@ -196,13 +196,18 @@ async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_p
 
 
 async def test_a_disk_that_is_gone_is_shown_and_no_fault(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    read_by: set[int] = set()
+
     def gone(path: object) -> None:
+        read_by.add(threading.get_ident())
         raise OSError("the disk was pulled out")
 
     monkeypatch.setattr(supervisor, "DISK_PERIOD_S", 0.0)
     monkeypatch.setattr(supervisor.shutil, "disk_usage", gone)
-    await until(lambda: rig.session.store.status.recorder.free_bytes is None)
-    assert rig.state is S.IDLE
+    await until(lambda: read_by and rig.session.store.status.recorder.free_bytes is None)
+    assert rig.state is S.IDLE and threading.get_ident() not in read_by, (
+        "one that hangs holds no heartbeat up"
+    )
 
 
 async def test_an_open_session_keeps_its_plan(rig: Rig, small_plan: Plan) -> None:

@@ -45,7 +45,7 @@ class Previewer:
         """Return image and detection of the newest preview; None without one."""
         async with self._taking:
             if time.monotonic() - self._taken_s >= PREVIEW_PERIOD_S:
-                await self._take()
+                await asyncio.shield(self._take())  # for all screens, also where the one that asked closes
         if self._picture is None or self._sighting is None:
             return None
         return self._picture, self._sighting

@@ -20,6 +20,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from station.session import previews
 from tests.codes import raises
+from tests.patience import until
 from tests.station.session_rig import NewRig, Rig
 
 TAG = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)
@@ -110,3 +111,27 @@ async def test_a_silent_camera_is_told_and_one_lost_frame_is_not(
     monkeypatch.setattr(previews, "OLD_S", 0.0)
     await look()
     assert told()
+
+
+async def test_a_screen_that_closes_takes_no_look_from_the_others(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As nothing but the worker's end would end what it does for a call that nobody wants."""
+    call, asked, ended, answer = rig.worker.call, asyncio.Event(), [], asyncio.Event()
+
+    async def slow(*arguments: Any, **named: Any) -> Any:
+        asked.set()
+        try:
+            await answer.wait()
+        finally:
+            ended.append(answer.is_set())
+        return await call(*arguments, **named)
+
+    monkeypatch.setattr(rig.worker, "call", slow)
+    closing = asyncio.create_task(rig.session.previews.preview(64, 64))
+    await asked.wait()
+    closing.cancel()
+    await asyncio.wait({closing})
+    answer.set()
+    await until(lambda: ended)
+    assert ended == [True]

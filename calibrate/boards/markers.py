@@ -21,9 +21,10 @@ _SMALL_MARKER_PX, _ENLARGED, _LARGEST_SIDE_PX = 20.0, 3.0, 6000
 """Markers with shorter sides are read in an enlarged image, unless that would be larger than this."""
 _SMALLEST_PERIMETER = 0.03
 """Perimeter of a marker over the longer side of the image; OpenCV's own."""
-_ASTRAY, _MOST = 0.25, 0.75
-"""Farther than this share of its side from where the board has it, a marker does not lie as printed; share of
-the markers that must. Of a board in the legacy order half of them do."""
+_ASTRAY, _MOST = 0.5, 0.75
+"""Farther than this share of its side from where the board has it, a marker does not lie as printed: half the
+way to the next one, as a lens bends the board; share of the markers that must. Of a board in the legacy order
+half of them do."""
 _NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
 """A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
 and than so many times the middle one."""

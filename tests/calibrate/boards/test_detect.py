@@ -17,7 +17,7 @@ from calibrate.boards.model import (
     looks_same_turns,
 )
 from calibrate.projection import project_at
-from recordings.schema.messages import BoardKind, BoardSpec
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.simulation.renderer import Light, render
 from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking
 
@@ -174,6 +174,16 @@ def test_no_part_of_another_board_is_taken_for_this_one(spec: BoardSpec, columns
         assert not found.found
         assert found.cause == "other-board" or spec.kind is not BoardKind.CHESSBOARD
         assert not detect(image, declared, thorough=False).found
+
+
+def test_a_grid_of_tags_is_found_by_a_lens_that_bends_it() -> None:
+    """Its plane is no plane in the image: a marker lies up to half its side from where one would have it."""
+    wide = CameraModel(640, 512, ((330, 0, 320), (0, 330, 256), (0, 0, 1)), (-0.3, 0.11, 0, 0, -0.015))
+    spec = BoardSpec(BoardKind.APRIL_GRID, 6, 6, 0.03, 0.009)
+    seen = np.eye(4)
+    seen[:3, 3] = [0, 0, 0.16] - board_points(spec).mean(axis=0)
+    image = render(wide, spec, seen, Light(pixel_noise=1.5), np.random.default_rng(0))
+    assert detect(image, spec).corners >= 0.8 * 144
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(7, 6), (4, 3)])

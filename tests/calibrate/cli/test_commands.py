@@ -146,7 +146,7 @@ def test_a_check_judges_the_calibration_that_it_was_made_on(
 
 
 def test_a_touch_test_does_not_begin_the_trend_anew(real_file: Path, tmp_path: Path) -> None:
-    """It makes another version of the same solve."""
+    """It makes another version of the same solve; another solve begins it."""
     install(real_file, root := tmp_path / "cell")
     check = ("--root", root, "--json")
     later = Scene(views=6, seed=5)
@@ -159,6 +159,10 @@ def test_a_touch_test_does_not_begin_the_trend_anew(real_file: Path, tmp_path: P
     touch = Touch(0, (0.0, 0.0), (0.1, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01")
     note_installed(root, [touch])
     assert json.loads(run("drift-check", new, *check, cwd=tmp_path).stdout)["trend"]
+    anew = msgspec.structs.replace(read_calibration(real_file), created="2026-01-02T00:00:00+00:00")
+    write_calibration(anew, tmp_path / "anew.yaml")
+    install(tmp_path / "anew.yaml", root)
+    assert not json.loads(run("drift-check", new, *check, cwd=tmp_path).stdout)["trend"]
 
 
 @pytest.mark.parametrize("lost", ["checks.jsonl", "validity.jsonl"])

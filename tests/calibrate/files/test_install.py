@@ -183,7 +183,7 @@ MISSED = Touch(0, (0.0, 0.0), (9.0, 0.0), (0.1, 0.1), "told by a person", "anna"
 
 
 def test_a_kill_at_any_touch_of_the_folder_leaves_old_or_new(make_file, tmp_path: Path) -> None:
-    """Fault 46: SIGKILL before each call that opens, makes, renames, links or removes something there."""
+    """Fault 46: SIGKILL before each call that opens, writes, renames, links or removes something there."""
     old, new = make_file(), make_file(0.001)
     install(old, template := tmp_path / "template")
     results = {name: read_calibration(path) for name, path in (("old", old), ("new", new))}
@@ -206,18 +206,25 @@ def test_a_kill_at_any_touch_of_the_folder_leaves_old_or_new(make_file, tmp_path
 
 
 def _killed(place: int, new: Path, root: Path) -> bool:
-    """Install in a process that is killed before it touches the folder once more than `place` times."""
+    """Install in a process that is killed before it touches the folder or writes more than `place` times."""
     child = os.fork()
     if child:
         return os.waitpid(child, 0)[1] == signal.SIGKILL
     touched = count()
 
-    def strike(event: str, given: tuple[object, ...]) -> None:
-        if any(str(value).startswith(str(root)) for value in given) and next(touched) == place:
+    def strike(touches: bool) -> None:
+        if touches and next(touched) == place:
             os.kill(os.getpid(), signal.SIGKILL)
 
+    def touch(event: str, given: tuple[object, ...]) -> None:
+        strike(any(str(value).startswith(str(root)) for value in given))
+
+    def call(frame: object, event: str, called: Any) -> None:
+        strike(event == "c_call" and called.__name__ in ("write", "fsync"))
+
     try:
-        sys.addaudithook(strike)
+        sys.addaudithook(touch)
+        sys.setprofile(call)
         install(new, root)
     finally:
         os._exit(0)

@@ -124,6 +124,7 @@ def test_a_script_that_is_armed_late_waits_for_its_first_keepalive() -> None:
     made.sequence, made.verb = made.sequence + 1, Command.ARM
     made.run(0.19, kick=False)
     assert made.plays and made.state is State.ARMED
+    made.sequence += 1  # from then on no command is a keepalive
     made.run(0.03, kick=False)
     assert not made.plays
 

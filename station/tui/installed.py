@@ -76,7 +76,9 @@ def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
         number, path = current_version(folder)  # one version, whatever is installed meanwhile
         now, validity = _read_at(path, path.stat().st_mtime_ns), validity_of(folder, number)
     with suppress(CalibrationError, OSError):
-        log, checks = read_log(root, camera), read_checks(root, camera)
+        log = read_log(root, camera)
+    with suppress(CalibrationError, OSError):
+        checks = read_checks(root, camera)
     versions = {entry.generation: readable(folder, entry.generation) for entry in log}
     ours = [number for number, version in versions.items() if version and same_solve(version, now)]
     earlier = [version for number, version in versions.items() if version and number not in ours]

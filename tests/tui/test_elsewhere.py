@@ -118,6 +118,7 @@ async def test_before_a_session_the_result_is_what_is_installed(link: FakeLink, 
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.known.result and app.known.sessions)
+        assert app.known.result is not None and app.known.result.state.log
         assert next_action(app.known).key == "d"
         link.show(in_session(idle(), name="s-3"))
         await until(pilot, lambda: app.known.result is None)

@@ -129,7 +129,8 @@ def quick_covariance(quick: QuickFit, board: BoardSpec, free_lens: bool) -> Arra
     flange = views.base_from_flange
     each = view_information(views.mount, views.camera, flange, quick.X, quick.Y, points, quick.noise)
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
-    covariance = covariance_of(each.sum(axis=0), prior)[:6, :6]
+    # A view that contradicts the others tells nothing.
+    covariance = covariance_of(np.tensordot(quick.fit.full, each, 1), prior)[:6, :6]
     if not np.isfinite(covariance).all():
         raise np.linalg.LinAlgError("the board is out of sight")
     return covariance

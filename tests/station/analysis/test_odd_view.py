@@ -104,3 +104,4 @@ def test_what_cannot_be_is_named_and_what_can_is_not(mount: Mount) -> None:
     torn = changed(count, other_tool, slice(since, None))
     found = find_cell(mount, truth.board, blank, False, torn)
     assert found is None or (found.cause and not found.good)
+    assert not running_estimate(cell_config(truth), blank, False, torn).enough, "five of seven agree"

@@ -37,7 +37,7 @@ def test_distance_and_tilt_are_those_by_a_fisheye_lens(monkeypatch: pytest.Monke
     )
     points, C = board_points(PAPER_BOARD), seen_from(PAPER_BOARD, 0.2)
     pixels = project_pixels(lens, transform_points(C, points))
-    seen = Detection("", "", np.arange(len(points)), pixels, len(points), 640, 512, 0.0, 0.0, 0.5)
+    seen = Detection("", "", np.arange(len(points)), pixels, len(points), 640, 512, 0.0, 0.5)
     monkeypatch.setattr(worker, "detect", lambda *_: seen)
     status = sight(np.zeros((512, 640), np.uint8), PAPER_BOARD, lens, False).status
     assert status.distance_m == pytest.approx(0.2, abs=1e-4)

@@ -45,11 +45,19 @@ def chosen(image: str = "/cam/image_raw", wanted: Wanted | None = None, **topics
         "/tf": (Kind.TRANSFORMS, ur_frames()),
     }
     for name, told in topics.items():
-        kind = Kind.JOINTS if isinstance(told[0], JointMessage) else Kind.CAMERA
+        kinds = {JointMessage: Kind.JOINTS, list: Kind.TRANSFORMS}
+        kind = kinds.get(type(told[0]), Kind.CAMERA)
         values[name.replace("__", "/")] = kind, told
     described = {n: BagTopic(n, kind, "cdr", "", len(told)) for n, (kind, told) in values.items()}
     bag: Any = SimpleNamespace(topics=described, others=[], values=lambda name: iter(values[name][1]))
     return select(bag, wanted or Wanted())
+
+
+@pytest.mark.parametrize(("topic", "turned_rad"), [("__tf_static", 0.0), ("__left__tf", 0.5)])
+def test_what_a_static_topic_tells_holds_until_it_is_told_anew(topic: str, turned_rad: float) -> None:
+    moved = [[frame(t, "world", "base_link", turned(t / 8)) for t in (0, 8)]]
+    track = chosen(wanted=Wanted(base="world", flange="wrist_3_link"), **{topic: moved}).track
+    np.testing.assert_allclose(track.at(np.array([4]))[0], turned(turned_rad + 0.04), atol=1e-12)
 
 
 @pytest.mark.parametrize("wanted", [None, Wanted(base="base_link", flange="flange")])

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from recordings.files import create_exclusively
 from recordings.reader import open_recording
@@ -207,6 +208,16 @@ def test_an_empty_folder_and_a_name_that_is_no_recordings_are_said(tmp_path: Pat
     with refused("recording-name"):
         recover_recording(part, tmp_path / "b.bag")
     assert list(tmp_path.iterdir()) == [part]
+
+
+def test_a_whole_file_of_another_program_is_left_as_it_is(tmp_path: Path) -> None:
+    with (path := tmp_path / "a.mcap").open("wb") as file:
+        (writer := Writer(file)).start()
+        writer.finish()
+    before = path.read_bytes()
+    with refused("not-a-recording"):
+        recover_recording(path)
+    assert [each.read_bytes() for each in tmp_path.iterdir()] == [before]
 
 
 def test_a_disk_that_fails_during_recovery_leaves_everything_as_it_was(

@@ -157,7 +157,7 @@ def test_a_tag_of_another_number_or_seen_twice_is_not_the_board() -> None:
 @pytest.mark.parametrize(
     ("spec", "columns", "rows"),
     [
-        *((BoardSpec(BoardKind.CHESSBOARD, 8, 6, 0.019), *size) for size in ((7, 6), (6, 5), (6, 4))),
+        *((BoardSpec(BoardKind.CHESSBOARD, 8, 6, 0.019), *size) for size in ((7, 6), (6, 5), (6, 4), (8, 4))),
         (BoardSpec(BoardKind.CHESSBOARD, 9, 7, 0.017), 7, 5),
         (BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.011), 3, 9),
         (CHARUCO, 9, 6),

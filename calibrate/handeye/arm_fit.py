@@ -84,7 +84,7 @@ def estimate_with_arm_errors(
 
     The last errors of `observed` are a bracket's (`FLEX`), those before them the arm's: of its links or,
     where they are unknown, of its flange. The second value is the log evidence of errors of any size against
-    none; above 3 they are worth saying. Raises LinAlgError where it fails.
+    none; above 3 they are worth saying. Raises LinAlgError or BadViewsError where it fails.
     """
     state = replace(plain.state, arm_errors=np.zeros(observed.by_arm_errors.shape[2]))
     sizes = _Sizes(len(state.arm_errors) - len(FLEX))

@@ -17,7 +17,7 @@ class OtherCellError(UsageError):
     @property
     def device(self) -> str:
         """Which device differs, "robot" or "camera"; empty when something else or both do."""
-        differs = str(self.values.get("differs", ""))
+        differs = str(self.values["differs"])
         return differs if differs in ("robot", "camera") else ""
 
 
@@ -36,16 +36,17 @@ class CellIdentity(msgspec.Struct, frozen=True):
 
 
 def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) -> None:
-    """Raise OtherCellError for views of another mounting, source, robot or camera than the calibration's."""
+    """Raise OtherCellError for views of another mounting, robot or camera, or simulated and real ones."""
     simulated = calibration.source == "simulated"
-    for name, new, known, same in (
+    compared = (
         ("mounting", seen.mount, calibration.mount, seen.mount == calibration.mount),
         ("source", seen.source, calibration.source, (seen.source == "simulated") == simulated),
         ("robot", *_serials(seen.robot_serial, calibration.robot.serial)),
         ("camera", *_serials(seen.camera_serial, calibration.camera.serial)),
-    ):
-        if not same:
-            raise OtherCellError(where=where, differs=name, found=str(new), calibrated=str(known))
+    )
+    if others := [(name, str(new), str(known)) for name, new, known, same in compared if not same]:
+        differs, found, calibrated = map(" and ".join, zip(*others, strict=True))
+        raise OtherCellError(where=where, differs=differs, found=found, calibrated=calibrated)
 
 
 def _serials(new: str, known: str) -> tuple[str, str, bool]:

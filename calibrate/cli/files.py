@@ -68,8 +68,7 @@ def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
             "width": plain["image_width"],
             "height": plain["image_height"],
             "matrix": np.array(plain["camera_matrix"]["data"], float).reshape(3, 3).tolist(),
-            # one by one: PyYAML takes 1e-05 for a text
-            "distortion": [float(value) for value in plain["distortion_coefficients"]["data"]],
+            "distortion": plain["distortion_coefficients"]["data"],
             "distortion_model": model,
         }
         return msgspec.convert(fields, CameraModel)

@@ -44,11 +44,11 @@ def predicted_error(error_mm: float | None, distance_m: float | None) -> ShownFi
 
 
 def figures(calibration: Calibration) -> dict[str, ShownFigure]:
-    """Collect the figures that a calibration is judged by, most important first, without unknown ones."""
+    """Collect the known figures that a calibration is judged by, most important first; the error always."""
     quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
     error = predicted_error(quality.predicted_error_mm, quality.working_distance_m)
-    without = ", the arm's own error only in part" * quality.without_arm
-    shown = {"error": replace(error, about=error.about + without)}
+    without = "the arm's own error only in part" * quality.without_arm
+    shown = {"error": replace(error, about=", ".join(filter(None, (error.about, without))))}
     if (held := quality.holdout) is not None:
         missed = f"{1000 * held.e_t_m:.3g} mm, e_R {held.e_R:.3g}"
         shown["held_out"] = ShownFigure("held-out error", missed, f"over {len(held.pairs)} samples")
@@ -172,6 +172,8 @@ def _gate_table(calibration: Calibration) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
     for gate in calibration.quality.gates:
         mark = Text("✓", style="green") if gate.passed else Text("✗", style="bold red")
+        if gate.narrow:
+            mark = Text("▲", style="yellow")
         table.add_row(mark, gate.name, Text(gate.text))
     return table
 

@@ -25,7 +25,7 @@ from station.devices.news import RESTING_S
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import arm_held, control_ended, foreign_program
-from station.devices.ur_dashboard import STOP, Dashboard, DashboardError, came
+from station.devices.ur_dashboard import STOP, STOPPED, Dashboard, DashboardError, came
 from station.devices.ur_end_cause import cause_of_end
 from station.devices.ur_link import UrLink, link_lost
 from station.devices.ur_moves import MoveWatch, check_goal
@@ -299,10 +299,10 @@ class UrRobot(UrLink):
             await asyncio.wait(self._background)
 
     async def _finish_stop(self, child: ControlChild | None, reply: asyncio.Future[str] | None) -> None:
-        """Complete a stop: repeat the dashboard's on a new connection if it did not answer; end the child."""
-        answered = reply is not None and await came(reply, STOP_WAIT_S)
+        """Complete a stop: repeat the dashboard's on a new connection if it did not obey; end the child."""
+        obeyed = reply is not None and await came(reply, STOP_WAIT_S) and reply.result() == STOPPED
         ending = [child.end_after_stop(STOP_WAIT_S)] if child is not None else []
-        if not answered:
+        if not obeyed:
             ending.append(self._dashboard_stop_anew())
         await asyncio.gather(*ending)
         if child is not None:

@@ -45,7 +45,7 @@ def verdict_lines(result: Result) -> Content:
     calibration = result.calibration
     if calibration is None:
         return Content(result.problem or NO_RESULT)
-    quality, failed = calibration.quality, calibration.quality.failed
+    quality = calibration.quality
     state = "ready to install" if result.verdict == "PASS" else "installs only with a reason"
     before = any(same_solve(earlier, calibration) for earlier in result.state.earlier)
     if result.installed:
@@ -53,7 +53,7 @@ def verdict_lines(result: Result) -> Content:
     elif before:
         state = "installed before"
     said = use_text(calibration)
-    if result.verdict == "PASS WITH A REASON" and not failed:
+    if result.verdict == "PASS WITH A REASON":
         said = accuracy_text(calibration)
     rows = [Content.styled(f"{SHOWN[result.verdict][0]} {result.verdict}, {state}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:

@@ -134,6 +134,18 @@ async def test_a_robot_switched_to_remote_after_connecting_can_be_driven(cell: M
     assert c.robot.control
 
 
+@never_driven
+async def test_a_stop_that_a_connection_from_local_control_refuses_is_given_on_a_new_one(
+    cell: MakeCell,
+) -> None:
+    c = await cell("UR10e", control=False, options=("--local",))
+    await c.ask("remote", on=True)
+    await c.ask("foreign", name="palletising.urp")
+    await c.until(lambda state: state["runtime_state"] == "PLAYING")
+    await c.robot.stop("F12")
+    await c.until(lambda state: state["runtime_state"] == "STOPPED")
+
+
 async def test_remote_control_lost_between_moves_ends_control(cell: MakeCell) -> None:
     c = await cell("UR10e")
     await c.ask("remote", on=False)

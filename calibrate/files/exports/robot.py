@@ -66,7 +66,7 @@ def corrected_urdf(calibration: Calibration, frames: FrameNames, given: bytes) -
     parent, place = (found.tip, tip_from_flange) if in_hand else (found.base, inverse(B))
     note = commented(comment(calibration, frames, corrected=True))
     added = (note + camera(place @ X.matrix, parent, frames)).encode("ascii", "xmlcharrefreplace")
-    changes = [(given.rindex(b"</"), given.rindex(b"</"), added)]
+    changes = [(robot.end, robot.end, added)]
     for joint, was, origin in zip(found.joints, found.origins, origins, strict=True):
         if np.abs(was - origin).max() > _EXACT:
             changes.append(robot.with_origin(joint, origin))
@@ -84,6 +84,8 @@ class Urdf:
     root: Element
     at: dict[Element, int]
     """Where in the file each element begins."""
+    end: int
+    """Where the tag that ends the robot begins."""
     joints: dict[str, Element]
     """By the link that each carries."""
 
@@ -91,13 +93,14 @@ class Urdf:
     def read(cls, given: bytes) -> Urdf:
         if b"xacro:" in given or b"<!DOCTYPE" in given or b"\0" in given:
             raise ValueError("it is no plain URDF in UTF-8 (xacro robot.xacro > robot.urdf)")
-        starts: list[int] = []
+        starts, ends = list[int](), list[int]()
         parser = expat.ParserCreate()
         parser.StartElementHandler = lambda *_: starts.append(parser.CurrentByteIndex)
+        parser.EndElementHandler = lambda *_: ends.append(parser.CurrentByteIndex)
         parser.Parse(given, True)
         root = ElementTree.fromstring(given)
         joints = {_child(joint, "child").attrib["link"]: joint for joint in root.findall("joint")}
-        return cls(given, root, dict(zip(root.iter(), starts, strict=True)), joints)
+        return cls(given, root, dict(zip(root.iter(), starts, strict=True)), ends[-1], joints)
 
     def way(self, link: str) -> list[Element]:
         """List the joints from the root to a link."""
@@ -223,7 +226,8 @@ def _paths(robot: Urdf, n: int, frames: FrameNames) -> Iterator[_Path]:
 def _recognise(paths: list[_Path], arm: CorrectedArm) -> tuple[_Path, Array, Array]:
     """Find path, B and T with which the controller's base_from_flange is B · base_from_tip · T.
 
-    Links as named come first, then a constant tool, then a turned base; then other signs of the joints.
+    Tried in this order: the links as named; with a constant tool; with a turned base as well; then all three
+    again with other signs of the joints.
     """
     nominal, eye = arm.nominal_chain, np.eye(4)
     n = len(nominal.axes)
@@ -231,13 +235,15 @@ def _recognise(paths: list[_Path], arm: CorrectedArm) -> tuple[_Path, Array, Arr
         raise ValueError(f"no link is carried by {n} turning joints: name --base and --flange")
     q = sample_range(np.array(arm.joints_rad or [(-1.0, 1.0)] * n).T, 40)
     told, least_m = nominal.forward(q), np.inf
+    turned = _turned(told)
     for signs in sorted(product((1.0, -1.0), repeat=n), key=lambda signs: -sum(signs)):
         tried = [replace(path, axes=np.array(signs)[:, None] * path.axes) for path in paths]
         pairs = [(path, path.chain.forward(q)) for path in tried]
         pairs.sort(key=lambda pair: float(np.linalg.norm((pair[1] - told)[0, :3, 3])))  # the least tool first
-        turned, own = (rotation_angle((inverse(F[:1]) @ F)[:, :3, :3]) for F in (told, pairs[0][1]))
-        if np.isfinite(least_m) and np.sqrt(np.mean((turned - own) ** 2)) > _MAX_OFF_RAD:
-            continue  # whatever base and tool are
+        if np.isfinite(least_m):  # no base or tool mends another angle between two places
+            pairs = [
+                pair for pair in pairs if np.sqrt(np.mean((_turned(pair[1]) - turned) ** 2)) <= _MAX_OFF_RAD
+            ]
         for way, (path, place) in product(range(3), pairs):
             B, T = eye, eye if way == 0 else mean_pose(inverse(place) @ told)
             if way == 2:
@@ -248,3 +254,8 @@ def _recognise(paths: list[_Path], arm: CorrectedArm) -> tuple[_Path, Array, Arr
                 return path, B, T
             least_m = min(least_m, float(off[0]))
     raise UsageError("urdf-other-arm", off_mm=1e3 * least_m)
+
+
+def _turned(poses: Array) -> Array:
+    """Compute the angles (n,) between the first pose and each."""
+    return np.asarray(rotation_angle((inverse(poses[:1]) @ poses)[:, :3, :3]))

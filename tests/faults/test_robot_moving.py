@@ -214,10 +214,13 @@ async def test_at_a_slow_slider_the_move_arrives(cell: MakeCell) -> None:
 
 async def test_at_slider_zero_the_arm_waits_and_the_operator_is_told(cell: MakeCell) -> None:
     c = await cell()
-    move = await c.cruising()
-    await c.ask("slider", fraction=0.0)
-    await until(lambda: "slider on the pendant is at 0" in c.robot.notice)
-    await asyncio.sleep(0.3)
-    assert not move.done()
-    await c.ask("slider", fraction=1.0)
-    await move
+    while True:
+        move = await c.cruising()
+        await c.ask("slider", fraction=0.0)
+        await until(lambda move=move: move.done() or "slider on the pendant is at 0" in c.robot.notice)
+        await asyncio.sleep(0.3)
+        waited = not move.done()
+        await c.ask("slider", fraction=1.0)
+        if not await c.go_on(move):  # late news of a busy computer did not end it
+            assert waited
+            return

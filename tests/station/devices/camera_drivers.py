@@ -107,6 +107,8 @@ class Film:
         return self._video.set(name, value)
 
     def get(self, name: int) -> float:
+        if name == cv2.CAP_PROP_POS_MSEC and name not in self.controls:
+            return self._due_s * 1e3  # the kernel's stamp: a busy computer does not make it later
         return self.controls.get(name, self._video.get(name))
 
     def grab(self) -> bool:

@@ -16,8 +16,8 @@ class OtherCellError(UsageError):
 
     @property
     def device(self) -> str:
-        """Which device differs, "robot" or "camera"; empty when something else or both do."""
-        differs = str(self.values["differs"])
+        """Which device differs first, "robot" or "camera"; empty when something else does."""
+        differs = str(self.values.get("differs", ""))
         return differs if differs in ("robot", "camera") else ""
 
 
@@ -38,15 +38,14 @@ class CellIdentity(msgspec.Struct, frozen=True):
 def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) -> None:
     """Raise OtherCellError for views of another mounting, robot or camera, or simulated and real ones."""
     simulated = calibration.source == "simulated"
-    compared = (
+    for name, new, known, same in (
         ("mounting", seen.mount, calibration.mount, seen.mount == calibration.mount),
         ("source", seen.source, calibration.source, (seen.source == "simulated") == simulated),
         ("robot", *_serials(seen.robot_serial, calibration.robot.serial)),
         ("camera", *_serials(seen.camera_serial, calibration.camera.serial)),
-    )
-    if others := [(name, str(new), str(known)) for name, new, known, same in compared if not same]:
-        differs, found, calibrated = map(" and ".join, zip(*others, strict=True))
-        raise OtherCellError(where=where, differs=differs, found=found, calibrated=calibrated)
+    ):
+        if not same:
+            raise OtherCellError(where=where, differs=name, found=str(new), calibrated=str(known))
 
 
 def _serials(new: str, known: str) -> tuple[str, str, bool]:

@@ -72,7 +72,7 @@ def urdf_of(name: str, flange: str = "tool0", signs: Array | float = 1.0, seed: 
         f'<parent link="{flange}"/><child link="finger"/><limit lower="0" upper="1" effort="1" velocity="1"/>'
         "</joint>\n"
         '<transmission name="t"><joint name="joint_0"><origin xyz="0 0 0"/></joint></transmission>\n'
-        "</robot>\n"
+        "</robot>\n<!-- was: </link> -->\n"
     )
     return "\n".join(parts).encode()
 

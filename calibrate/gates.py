@@ -1,9 +1,9 @@
 """Gates: named conditions that a calibration must meet before it may be installed.
 
-A gate is, under one name, a limit in `GateLimits` and a figure that `_measured` yields of the solution, with
-title, unit and remedy. A new figure is a field of `handeye.solution.Solution`, filled by
-`_describe` in `handeye.solve`. A gate without a value has a function of its own that `judge` calls, such as
-`_session_gate`.
+A gate is, under one name, a limit in `GateLimits` and a figure that `_measured` yields of the solution,
+with title, unit and remedy. A new figure is a field of `handeye.solution.Solution`, filled in
+`handeye.solve`, for the default profile and the paper's. A gate without a value has a function of its own
+that `judge` calls, such as `_session_gate`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     predicted_error_m: float | None = 0.002
     """1σ of a point at the working distance."""
     coverage: float | None = 0.25
-    """Share of the image in which corners were seen, when the intrinsics were estimated from these images."""
+    """Share of the image inside the outlines of all boards, where the intrinsics were estimated here."""
     lens_pull: float | None = 1.0
     """Shift of X caused by the given intrinsics, beyond their tolerance, over its error without an arm's."""
     board_pull: float | None = 1.0

@@ -36,9 +36,9 @@ class LinearSolution:
     step: Array
     """(G,) in the order of `Layout`."""
     precision: Array
-    """(G, G) information at the present class probabilities, which it takes as certain."""
+    """(G, G) information, as if the present class probabilities were known."""
     W: Array
-    """(n, 6, 6) what of it each residual has."""
+    """(n, 6, 6) information of each residual."""
     scales: Scales
     chances: Array
     """(n, K) probability of each noise class, per view."""
@@ -47,8 +47,8 @@ class LinearSolution:
     z: Array
     """(n, K, 6) S_k⁻¹ m at the step's end."""
     log_evidence: float
-    """Log evidence (Laplace) of the robot's residuals, and of the corners' above those of the best lens and
-    shape; up to a constant."""
+    """Log evidence (Laplace) of the robot's residuals, and of the corners', relative to the best lens
+    and shape; up to a constant."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,5 +3,5 @@
 ur*        a Universal Robots arm: `ur` controls it, `ur_link` reads it, `ur_child` starts `ur_control`
 posted     an arm that a person moves, whose pose a program posts (`posts`: its lines)
 aravis*    GenICam cameras; `webcam`; `playback`: a recording as arm and camera
-frame*     images with their times, for every camera driver
+frames     images with their times, for every camera driver
 """

@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 SOURCES: dict[Source, str] = {"real": "live", "simulated": "simulated", "playback": "playback"}
 """What a program must declare in a cell of each kind."""
 READ_BYTES, PAUSE_S, LINES_READ = 8192, 0.005, 50
-"""So much is read at once, then a pause; of what came together only the newest lines are looked at."""
+"""Read at once, then a pause; of what came together only the newest `LINES_READ` lines are parsed."""
 LINE_BYTES = 2048
 STATES_KEPT = 20_000
 """Of `HISTORY_S` at most, whatever times are posted."""
@@ -55,7 +55,7 @@ WRONG_S = 1.0
 TOLD_S = 10.0
 """So long a notice stays."""
 JUMP_M_S, JUMP_RAD_S = 2.5, 10.0
-"""Ten times the speed to which arms are limited while a person is near (0.25 m/s); more is no motion."""
+"""Ten times the speed to which arms are limited while a person is near (0.25 m/s); faster is a wrong post."""
 ARRIVAL_S = 0.1
 """Posts without a time of their own may have been held up for so long on their way."""
 CLOCK_STEP_S = 1.0
@@ -187,7 +187,7 @@ class PostedArm:
         if (serving := asyncio.current_task()) is not None:
             self._links[writer] = serving
         try:
-            # Each door has its own, or strangers at the port would keep the socket's programs out.
+            # Socket and port each have this limit, or strangers at the port would keep programs out.
             if sum(one.get_extra_info("socket").family == family for one in self._links) > LINKS:
                 raise RobotError("post-refused", poster=poster, reason=f"{LINKS} programs are connected")
             if token and not await _gives(token, reader):

@@ -1,4 +1,4 @@
-"""Client of the dashboard server (port 29999): queries, and the only command this station sends: `stop`.
+"""Client of the dashboard server (port 29999): queries, and the only command that changes anything: `stop`.
 
 Source: Universal Robots, "Dashboard Server e-Series / CB-Series, port 29999". One line per command, one line
 per reply, in order. Commands that are not in ALLOWED, such as unlock, power on or reset, are never sent.
@@ -24,7 +24,7 @@ ALLOWED = frozenset(
 )  # fmt: skip
 LINE_LIMIT = 4096
 REPEAT_S = 0.25
-"""Period of requests for a connection: the kernel repeats a lost one only after a second."""
+"""A connection is asked for again after so long: the kernel alone would wait a second."""
 
 
 class DashboardError(RobotError):
@@ -84,7 +84,7 @@ class Dashboard:
         return not self._task.done() and not self._writer.is_closing()
 
     def send(self, command: str) -> asyncio.Future[str]:
-        """Send a command before returning; the future gives the reply."""
+        """Write a command now; the future gives the reply."""
         if command not in ALLOWED:
             raise ValueError(f"the dashboard command {command!r} is never sent by this station")
         reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()

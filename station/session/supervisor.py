@@ -121,9 +121,9 @@ class SessionSupervisor:
         self.monitor = Monitor(context)
         self._lost = lost
         self.first: Callable[[], None] = lambda: None
-        """Called first in every round."""
+        """Called first in every round: the daemon reads STOP's socket here, too."""
         self.ticked: Callable[[], None] = lambda: None
-        """Called after every round."""
+        """Called after every round: the daemon tells systemd's watchdog."""
         self._silent = ""
         """Code of what is wrong while the robot's states are later than allowed; empty: they are not."""
         self._late_since_s = 0.0

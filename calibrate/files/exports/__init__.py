@@ -2,9 +2,10 @@
 
 A format is a function from Calibration and FrameNames to the file's text, and its row in `FORMATS`: the
 command, its help and the tests take it from there. `vision.zivid` is a short example. The camera's place is
-`calibration.transform.matrix`, parent_from_optical (4, 4) in metres, its lens `calibration.intrinsics.model`.
-Every file begins with `frames.comment`. A reader in `tests/foreign/export_readers.py`, by another library or
-by that program's own rule, must find 500 known points where the calibration shows them.
+`calibration.transform.matrix`, the camera's optical frame in its parent, (4, 4) in metres, its lens
+`calibration.intrinsics.model`. Every file holds `frames.comment`, as a comment or a text of its own. A
+reader in `tests/foreign/export_readers.py`, by another library or by that program's own rule, must find 500
+known points where the calibration shows them.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ class Format(NamedTuple):
     """For `calibrate export --help`."""
     make: Callable[[Calibration, FrameNames], str]
     frames: Literal["fixed", "named", "attached"] = "fixed"
-    """fixed: it names no frame of the robot. named: it does, and others may be given. attached: it can place
-    a camera driver's own frame, too."""
+    """fixed: it names no frame of the robot, and refuses others. named: it does, and others may be given
+    (`frames.place`). attached: it can place a camera driver's own frame, too."""
 
 
 FORMATS: dict[str, Format] = {

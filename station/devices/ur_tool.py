@@ -13,6 +13,7 @@ big-endian. Source: Universal Robots, "Remote control via TCP/IP: client interfa
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import struct
@@ -125,7 +126,9 @@ class PrimaryReader:
 
     async def first(self) -> Installation:
         """Wait for the first state; empty when the port is closed, or none comes in time (firewall)."""
-        await self._first.wait()
+        with contextlib.suppress(TimeoutError):  # of a controller that sends other messages only
+            async with asyncio.timeout(2 * SILENCE_S):
+                await self._first.wait()
         return self.installation
 
     async def _run(self) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
+
 from calibrate.check.history import read_checks
 from calibrate.files.install import installed_calibration
 from station.cell.status import CHECK_VIEWS, SessionStatus, StationState, StationStatus
@@ -20,30 +22,29 @@ async def start_drift_check(
 ) -> bool:
     """Plan a few poses, ask, start; an arm that a person moves is guided. False: not approved, nothing moved.
 
-    A loaded plan that was never run is named in the question, and loaded again where nothing was started.
+    The loaded plan, or none, stands again where nothing was started; the question names one never run.
     Raises CalibrationError before anything is planned when nothing is installed below the daemon's root.
     """
     installed_calibration(link.root, link.camera)
     if status.robot.by_hand:
         await link.call(Freedrive(True, check=True))
         return True
-    before = (await link.call(GetPlan())).plan if _never_run(status) else None
-    lost = 0 if before is None else len(before.poses)
-    warnings = () if before is None else (f"the loaded plan of {lost} poses, never run, is replaced",)
+    before, lost = (await link.call(GetPlan())).plan, _never_run(status)
+    warnings = (f"the loaded plan of {lost} poses, never run, is replaced",) if lost else ()
     await link.call(MakePlan(poses, SEED, lens_known=True), timeout_s=PREPARE_S)
-    started = False
+    made, started = (await link.call(GetPlan())).plan, False
     try:
         started = await prepared_motion(link, Prepare(Purpose.DRIFT_CHECK), approve, warnings=warnings)
     finally:
-        if before is not None and not started:
-            await link.call(LoadPlan(before))
+        if made is not None and not started:
+            await link.call(LoadPlan(before or msgspec.structs.replace(made, poses=())))
     return started
 
 
-def _never_run(status: StationStatus) -> bool:
-    """Tell whether a plan is loaded of which no pose was ever tried, so that it should be kept."""
+def _never_run(status: StationStatus) -> int:
+    """Count the poses of a loaded plan of which none was ever tried."""
     poses = status.session.poses
-    return bool(poses) and not any(pose.attempt for pose in poses)
+    return 0 if any(pose.attempt for pose in poses) else len(poses)
 
 
 async def recorded(link: Client, before: str) -> SessionStatus | None:

@@ -66,16 +66,19 @@ async def test_a_plan_that_was_never_run_is_named_before_it_is_replaced(
     assert link.asked[-1] == verbs.Go("t", PREVIEW.approval_sha256)
 
 
+@pytest.mark.parametrize("attempt", [0, 1])
 @pytest.mark.parametrize("refused", [None, verbs.Prepare, verbs.Go])
-async def test_it_is_loaded_again_where_nothing_was_started(refused: type[verbs.Verb[Any]] | None) -> None:
+async def test_it_is_loaded_again_where_nothing_was_started(
+    refused: type[verbs.Verb[Any]] | None, attempt: int
+) -> None:
     link, approves = FakeLink(), AsyncMock(return_value=refused is not None)
     link.refuse = refused
     if refused is None:
-        assert not await start_drift_check(link, loaded(0), approves)
+        assert not await start_drift_check(link, loaded(attempt), approves)
         assert verbs.Go not in map(type, link.asked)
     else:
         with pytest.raises(RefusedError):
-            await start_drift_check(link, loaded(0), approves)
+            await start_drift_check(link, loaded(attempt), approves)
     assert link.asked[-1] == verbs.LoadPlan(LOADED)
 
 

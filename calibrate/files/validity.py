@@ -106,6 +106,12 @@ class Validity:
             return replace(changed, state=ValidityState.VALID, since=since, verified=time_text(when))
         return replace(changed, state=ValidityState.UNVERIFIED) if doubted else self
 
+    @property
+    def remedy(self) -> str:
+        """What makes it usable again; one that is valid needs nothing of it."""
+        withdrawn = self.state is ValidityState.WITHDRAWN
+        return WITHDRAWN_REMEDY if withdrawn else "Run `station drift-check`, or calibrate again"
+
     def _proven(self, now: datetime) -> datetime | None:
         """Time of the last proof; None where it is unknown, as with a clock that was ahead."""
         proven = parse_time(self.verified)
@@ -129,12 +135,11 @@ def require_usable(
     state = validity.state
     if state not in _REFUSED or (state is ValidityState.UNVERIFIED and not proven):
         return
-    withdrawn = state is ValidityState.WITHDRAWN
     raise InstallError(
         _REFUSED[state],
         what=what,
         held=validity_text(validity).rstrip("."),
-        advice=WITHDRAWN_REMEDY if withdrawn else "Run `station drift-check`, or calibrate again",
+        advice=validity.remedy,
         anyway=anyway,
         version=validity.version,
         since=validity.since,

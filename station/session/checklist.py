@@ -169,7 +169,7 @@ def _calibration_check(context: SessionContext) -> Check:
     text = f"version {found.version}: {validity_text(found.validity)}"
     if found.validity.state is ValidityState.VALID:
         return Check("calibration", "ok", text)
-    return Check("calibration", "warning", text, "run station drift-check, or calibrate again")
+    return Check("calibration", "warning", text, found.validity.remedy)
 
 
 def _disk_check(context: SessionContext) -> Check:

@@ -9,7 +9,7 @@ import pytest
 
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install, set_validity
-from calibrate.files.validity import ValidityReason, ValidityState
+from calibrate.files.validity import WITHDRAWN_REMEDY, ValidityReason, ValidityState
 from recordings.schema.messages import TimeSource
 from station.cell.clock_fit import ClockFit
 from station.cell.status import FrameTiming
@@ -106,7 +106,14 @@ async def test_a_camera_that_is_there_is_listed_with_what_keeps_it_from_being_us
 
 @pytest.mark.parametrize(
     ("change", "state"),
-    [("", "ok"), ("robot", "warning"), ("camera", "warning"), ("doubt", "warning"), ("damage", "failed")],
+    [
+        ("", "ok"),
+        ("robot", "warning"),
+        ("camera", "warning"),
+        ("in-doubt", "warning"),
+        ("withdrawn", "warning"),
+        ("damage", "failed"),
+    ],
 )
 async def test_what_is_installed_is_of_this_robot_and_camera_and_holds(
     rig: Rig, tmp_path: Path, change: str, state: str
@@ -121,9 +128,10 @@ async def test_what_is_installed_is_of_this_robot_and_camera_and_holds(
     )
     write_calibration(calibration_of(make_cell(), robot, camera), tmp_path / "cell.yaml")
     install(tmp_path / "cell.yaml", root, cell="simulated")
-    if change == "doubt":
-        set_validity(root, ValidityState.IN_DOUBT, ValidityReason("drift-check"))
+    if change in ("in-doubt", "withdrawn"):
+        set_validity(root, ValidityState(change), ValidityReason("drift-check"))
     if change == "damage":
         (root / "calibrations/current").resolve().write_text("format: handeye-calibration/1")
     found = await check(rig, "calibration")
+    assert (found.remedy == WITHDRAWN_REMEDY) == (change == "withdrawn"), "no check restores it"
     assert found.state == state and bool(found.remedy) == (state != "ok")

@@ -15,6 +15,7 @@ import fcntl
 import getpass
 import hashlib
 import os
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -46,6 +47,8 @@ from calibrate.files.validity import Validity, ValidityReason, ValidityState, ti
 from recordings.files import MAIN_CAMERA, open_regular, sync_folder, write_atomically
 from recordings.plain_text import plain_text
 
+_LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.1
+"""An installation takes a fraction of a second."""
 Action = Literal["install", "rollback", "verify"]
 
 
@@ -211,7 +214,7 @@ def locked(folder: Path) -> Iterator[None]:
         raise InstallError("state-folder", path=folder, why=problem.strerror) from None
     before = ""
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        _take(descriptor, folder)
         before = current_name(folder)
         yield
     except OSError as problem:
@@ -221,6 +224,21 @@ def locked(folder: Path) -> Iterator[None]:
         ) from None
     finally:
         os.close(descriptor)
+
+
+def _take(descriptor: int, folder: Path) -> None:
+    """Wait for the lock, and write into it who has it. InstallError where another holds it for too long."""
+    for left in reversed(range(_LOCK_TRIES)):
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            break
+        except BlockingIOError:
+            if not left:
+                holder = plain_text(os.pread(descriptor, 200, 0).decode(errors="replace"))
+                raise InstallError("install-busy", folder=folder, holder=holder or "a process") from None
+            time.sleep(_LOCK_PAUSE_S)
+    os.ftruncate(descriptor, 0)
+    os.pwrite(descriptor, f"process {os.getpid()} of {who()}".encode(), 0)
 
 
 def who() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import tempfile
 from pathlib import Path
 
@@ -39,6 +40,26 @@ def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(
         "rename current.new current",
         "sync calibrations",
     ]
+
+
+def test_a_stopped_process_that_installs_is_named_and_not_waited_for(
+    make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_LOCK_TRIES", 2)
+    (root := tmp_path / "s").mkdir()
+    if not (holder := os.fork()):
+        with module.locked(root / "calibrations"):
+            os.kill(os.getpid(), signal.SIGSTOP)
+        os._exit(0)
+    try:
+        os.waitpid(holder, os.WUNTRACED)
+        with raises("install-busy", InstallError) as refused:
+            install(make_file(), root)
+        assert str(holder) in refused.value.values["holder"]
+    finally:
+        os.kill(holder, signal.SIGKILL)
+        os.waitpid(holder, 0)
+    assert install(make_file(), root).current
 
 
 @pytest.mark.parametrize("what", ["generation", "current"])

@@ -10,16 +10,20 @@ from pathlib import Path
 import numpy as np
 
 from calibrate.boards.model import BoardError, check_board
-from calibrate.kinematics import MODELS
+from calibrate.kinematics import MODELS, forward
 from recordings import strict_yaml
 from recordings.files import read_file
 from recordings.schema.messages import CameraModel
 from recordings.strict_yaml import StrictYamlError, YamlProblem
-from station.cell.config import REAL_DRIVERS, CameraConfig, PoseGuess, StationConfig
+from station.cell.config import REAL_DRIVERS, CameraConfig, PoseGuess, RobotConfig, StationConfig
 from station.cell.errors import ConfigError
+from station.cell.layout import arm_model
 
 log = logging.getLogger(__name__)
 
+_POSTURES_RAD = np.array([[0.0] * 6, [0.0, -1.5, 1.5, -1.5, -1.5, 1.0]])
+_MOST_CORRECTION = 0.1
+"""Of the flange, m and rad; a factory corrects millimetres."""
 _FIELD_OF_VIEW = (np.deg2rad(2.0), np.deg2rad(150.0))
 """Plausible fields of view; outside them the focal length was not written in pixels."""
 _FOCAL_LENGTH = (
@@ -86,6 +90,9 @@ def _contradictions(config: StationConfig) -> Iterator[Problem]:
                 yield f"robot.{key}", "is for arms that the station moves", "Leave it out, or choose `ur`."
     elif robot.model not in MODELS:
         yield "robot.model", f"'{robot.model}' is not known", f"Give one of {', '.join(MODELS)}."
+    elif not _is_calibrated(robot):
+        text = f"moves the flange by more than {_MOST_CORRECTION} m, or turns it by more than as many radians"
+        yield "robot.kinematics", text, "Give the corrections of this arm, in metres and radians."
     if not robot.host and robot.driver == "ur":
         remedy = "Read it on the pendant: menu (top right) → About, or Settings → System → Network."
         yield "robot.host", "the controller's address is missing", remedy
@@ -118,6 +125,16 @@ def _contradictions(config: StationConfig) -> Iterator[Problem]:
             yield f"{name}.rotation_xyzw", text, "`station new` finds it without one."
     if config.camera.model is not None:
         yield from _lens_problems(config.camera.model)
+
+
+def _is_calibrated(robot: RobotConfig) -> bool:
+    """Tell whether a factory calibration leaves the flange near where the model has it.
+
+    Single corrections may be many metres: those of parallel axes cancel.
+    """
+    with np.errstate(all="ignore"):
+        away = forward(arm_model(robot), _POSTURES_RAD) - forward(MODELS[robot.model], _POSTURES_RAD)
+    return bool(np.abs(away).max() < _MOST_CORRECTION)
 
 
 def _webcam_problems(camera: CameraConfig) -> Iterator[Problem]:

@@ -108,6 +108,8 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
             f"model: {{width: 1280, height: 1024, matrix: {CENTRE_IN_MM}}}",
             "camera.model.matrix: the centre 3.2, -2.1 lies outside",
         ),
+        ("model: UR10", "model: UR10, kinematics: {d_m: [0, 1.0e+308, 0, 0, 0, 0]}", "robot.kinematics"),
+        ("model: UR10", "model: UR10, kinematics: {theta_rad: [0, 5, 0, 0, 0, 0]}", "robot.kinematics"),
         ("limits:", "pointer: {tip_m: [0, 0, 200]}\nlimits:", "pointer.tip_m[2]: Expected"),
     ],
 )

@@ -16,7 +16,7 @@ from textual.reactive import reactive
 from textual.screen import ModalScreen, Screen
 from textual.widgets import Footer, Static
 
-from station.cell.status import StationStatus
+from station.cell.status import StationState, StationStatus
 from station.protocol import verbs
 from station.protocol.states import LATCHED
 from station.protocol.verbs import Verb
@@ -249,8 +249,11 @@ class Framed(Screen[R]):
         """All keys; the footer shows those that do something now, the others say why not when pressed."""
         keys = super().active_bindings
         for key, active in keys.items():
-            if not self.does_something(active.binding.action):
-                keys[key] = active._replace(binding=replace(active.binding, show=False))
+            shown, action = active.binding, active.binding.action
+            if not self.does_something(action):
+                keys[key] = active._replace(binding=replace(shown, show=False))
+            elif action == "freedrive" and self.known.shown.state is StationState.FREE_DRIVE:
+                keys[key] = active._replace(binding=replace(shown, description="End freedrive"))
         return keys
 
     def does_something(self, action: str) -> bool:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import msgspec
+from textual.widgets._footer import FooterKey
 
 from station.cell.status import DetectionStatus, GuidanceStatus, PoseStatus, StationState, StationStatus
 from station.protocol import verbs
+from station.tui.app import StationApp
 from station.tui.task import Known, next_action
 from station.tui.widgets.preview import PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, until, with_robot
@@ -27,6 +29,10 @@ def outlined(pane: PreviewPane) -> int:
     return sum(pane.render_line(row).text.count("o") for row in range(pane.size.height))
 
 
+def footer(app: StationApp) -> dict[str, str]:
+    return {shown.key: shown.description for shown in app.screen.query(FooterKey)}
+
+
 async def test_the_wanted_view_is_drawn_a_view_sounds_and_is_taken_back(link: FakeLink) -> None:
     link.show(in_session(idle(), name=""))
     app = app_on(link)
@@ -34,10 +40,12 @@ async def test_the_wanted_view_is_drawn_a_view_sounds_and_is_taken_back(link: Fa
     app.bell = lambda: bells.append(1)
     async with app.run_test(size=(120, 36)) as pilot:
         await until(pilot, lambda: app.known.live is not None)
+        await until(pilot, lambda: footer(app).get("f3") == "Freedrive")
         await pilot.press("f3")
         await until(pilot, lambda: verbs.Freedrive(True) in link.asked)
         await until(pilot, lambda: app.current_mode == "capture")  # where the wanted view is drawn
         link.show(by_hand(2))
+        await until(pilot, lambda: footer(app).get("f3") == "End freedrive")
         pane = app.screen.query_one(PreviewPane)
         await until(pilot, lambda: outlined(pane) > 20)
         assert not bells, "these views were taken before this screen saw the session"

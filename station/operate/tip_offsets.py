@@ -19,6 +19,7 @@ from calibrate.check.board_now import BoardNow, found_points, locate_board, offs
 from calibrate.check.same_cell import CellIdentity, require_same_cell
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
+from calibrate.files.folders import VERSION_NAME
 from calibrate.files.install import installed_calibration
 from calibrate.files.touch import Touch
 from calibrate.files.versions import note_in_file, note_installed, same_solve
@@ -120,13 +121,16 @@ def _mm(metres: Array) -> tuple[float, float]:
 def note_touches(root: Path, file: Path, touches: list[Touch]) -> str:
     """Save touch tests in the file and in the installed calibration of the same solve; describe the result.
 
-    Raises CalibrationError, OSError.
+    `file` may be an installed version: these never change. Raises CalibrationError, OSError.
     """
-    noted, where = note_in_file(file, touches), f"Written into {file}"
+    kept = VERSION_NAME.fullmatch(file.name)
+    noted = read_calibration(file) if kept else note_in_file(file, touches)
+    where = [] if kept else [f"into {file}"]
     now = None
     with suppress(CalibrationError):
         now = installed_calibration(root, noted.camera_name)
     if same_solve(noted, now):
         made = note_installed(root, touches, noted.camera_name)
-        where += f" and into the installed calibration, now version {made.number}"
-    return f"{where}. {after_touches(touches)}."
+        where.append(f"into the installed calibration, now version {made.number}")
+    said = " and ".join(where) or "nowhere: another one is installed by now"
+    return f"Written {said}. {after_touches(touches)}."

@@ -109,20 +109,23 @@ def local(iso: str) -> str:
 
 
 def state_root(calibration: str | Path) -> Path:
-    """Return ROOT of ROOT/sessions/NAME/FILE; what is installed lies below the same ROOT."""
-    return Path(calibration).resolve().parents[2]
+    """Return ROOT of ROOT/sessions/NAME/FILE, or of an installed version."""
+    above = Path(calibration).resolve().parents
+    return above[4] if (above[3].name, above[2].name) == ("calibrations", "cameras") else above[2]
 
 
 def solved_file(session: SessionStatus, root: Path, camera: str) -> str:
     """Return the calibration file made from a session; empty: none yet.
 
-    Before a session and in a drift check, that of what is installed.
+    Before a session and in a drift check, that of what is installed, or the installed file itself.
     """
     path = Path(session.folder) / CALIBRATION_FILE
     if session.check or not session.name:
         if (now := read_installed(root, camera).now) is None:
             return ""
         path = root / "sessions" / now.provenance.session / CALIBRATION_FILE
+        if not path.is_file():
+            path = current_version(calibrations_folder(root, camera))[1]
     return str(path) if path.is_file() else ""
 
 

@@ -78,4 +78,4 @@ async def run_touch_test(link: DaemonLink, result: Result, _: Calibration) -> No
     words = await link.attempt(asyncio.to_thread(note_touches, state_root(path), path, touches))
     if words:
         link.app.notify(words, markup=False)
-        await link.app.show_result(result.path)
+        await link.app.show_result(link.app.result_path)

@@ -110,16 +110,25 @@ async def test_after_a_drift_check_the_result_is_what_it_judged(link: FakeLink, 
         await until(pilot, lambda: next_action(app.known).key == "d")
 
 
-async def test_before_a_session_the_result_is_what_is_installed(link: FakeLink, root: Path) -> None:
+@pytest.mark.parametrize("elsewhere", [False, True])
+async def test_before_a_session_the_result_is_what_is_installed(
+    link: FakeLink, root: Path, elsewhere: bool
+) -> None:
     """As a daemon knows nothing of the days before; and a file that cannot be read hides nothing else."""
     put(root, "s-1")
     (calibrations_folder(root) / "checks.jsonl").mkdir()
+    if elsewhere:  # solved in a shell
+        (root / "sessions" / "s-1" / "calibration.yaml").unlink()
     link.show(in_session(idle(), name="", poses=()))
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.known.result and app.known.sessions)
-        assert app.known.result is not None and app.known.result.state.log
+        assert app.known.result is not None and app.known.result.state.log and app.known.result.installed
         assert next_action(app.known).key == "d"
+        await pilot.press("4")
+        await until(
+            pilot, lambda: app.current_mode == "result" and app.screen.does_something("app.drift_check")
+        )
         link.show(in_session(idle(), name="s-3"))
         await until(pilot, lambda: app.known.result is None)
 

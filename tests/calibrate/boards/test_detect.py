@@ -176,6 +176,18 @@ def test_no_part_of_another_board_is_taken_for_this_one(spec: BoardSpec, columns
         assert not detect(image, declared, thorough=False).found
 
 
+@pytest.mark.parametrize("marker", [0.75, 0.8])
+def test_a_board_of_markers_is_a_chessboard_to_who_calls_it_one(marker: float) -> None:
+    board = msgspec.structs.replace(CHARUCO, marker_m=marker * CHARUCO.square_m)
+    squares = BoardSpec(BoardKind.CHESSBOARD, board.columns - 1, board.rows - 1, board.square_m)
+    for seed in range(6):
+        image, seen = picture(board, seed)
+        found, truth = detect(image, squares), project_at(CAMERA, seen, board_points(board))
+        assert found.found
+        off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
+        assert off.max() < 2.0
+
+
 def test_a_grid_of_tags_is_found_by_a_lens_that_bends_it() -> None:
     """Its plane is no plane in the image: a marker lies up to half its side from where one would have it."""
     wide = CameraModel(640, 512, ((330, 0, 320), (0, 330, 256), (0, 0, 1)), (-0.3, 0.11, 0, 0, -0.015))

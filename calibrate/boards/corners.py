@@ -124,13 +124,13 @@ def sample(grey: Grey, pixels: Array) -> Array:
 def square_greys(grey: Grey, grid: Array) -> Array:
     """Sample the squares between corners (r, c, 2) beside their own four: greys (4, r - 1, c - 1).
 
-    So near a corner a square is of one colour, a marker in its middle or not.
+    A tenth of a side from a corner a square is of one colour, even where a marker takes 0.8 of its side.
     """
-    quarters = []
+    beside = []
     for down in (0.1, 0.9):
         edge = (1 - down) * grid[:-1] + down * grid[1:]
-        quarters += [(1 - across) * edge[:, :-1] + across * edge[:, 1:] for across in (0.1, 0.9)]
-    return sample(grey, np.concatenate(quarters)).reshape(4, len(grid) - 1, -1)
+        beside += [(1 - across) * edge[:, :-1] + across * edge[:, 1:] for across in (0.1, 0.9)]
+    return sample(grey, np.concatenate(beside)).reshape(4, len(grid) - 1, -1)
 
 
 def contrasts(greys: Array) -> tuple[Array, Array]:

@@ -72,7 +72,7 @@ async def install_result(link: DaemonLink, result: Result, calibration: Calibrat
     oldest = None if config is None else config.validity.max_age_days
     put = partial(install, Path(result.path), state_root(result.path), cell=cell, max_age_days=oldest)
     if await link.attempt(_installed(link, put)) is not None:
-        link.app.result_path = link.app.result_path  # read again at once
+        link.app.result_path = link.app.result_path  # the same, but its file is read again
         link.app.notify("Installed. b undoes it.")
 
 

@@ -85,8 +85,3 @@ def percentiles(values: Array) -> str:
     """Median (5 % … 95 %)."""
     low, middle, high = np.percentile(values, [5, 50, 95])
     return f"{middle:.3g} ({low:.3g} … {high:.3g})"
-
-
-def share_spread(share: float, count: int) -> float:
-    """Standard error of a share, in the same unit as `share` (0…1)."""
-    return float(np.sqrt(max(share * (1 - share), 0.25 / count) / count))

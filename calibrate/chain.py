@@ -64,10 +64,7 @@ class Chain:
         step[..., :3, :3] = turn
         step[..., :3, 3] = self.points - np.einsum("mnij,nj->mni", turn, self.points)
         step[..., 3, 3] = 1.0
-        moved = [np.broadcast_to(np.eye(4), (len(step), 4, 4))]
-        for joint in range(step.shape[1]):
-            moved.append(moved[-1] @ step[:, joint])
-        return np.stack(moved, axis=1)
+        return _accumulated(step)
 
     def forward(self, joints_rad: Array) -> Array:
         """Compute base_from_flange (m, 4, 4) of joints (m, n)."""
@@ -79,10 +76,9 @@ class Chain:
 
     def with_errors(self, errors: Array) -> Chain:
         """Return the arm whose links have these errors (6(n - 1),), as in `by_links`."""
-        moved = [np.eye(4)]
-        for point, error in zip(self._towards_next(), errors.reshape(-1, 6), strict=True):
-            R = rotation_exp(error[3:])
-            moved.append(moved[-1] @ pose(R, point + error[:3] - R @ point))
+        errors, points = errors.reshape(-1, 6), np.array([*self._towards_next()])
+        R = rotation_exp(errors[:, 3:])
+        moved = _accumulated(pose(R, points + errors[:, :3] - (R @ points[..., None])[..., 0])[None])[0]
         return self._moved(np.array([*moved, moved[-1]]), self.posture_rad)
 
     def _moved(self, moved: Array, posture_rad: Array) -> Chain:
@@ -267,10 +263,14 @@ _PRECISE = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-15, "max_nfev": 30}
 
 def _products(axes: Array, away: Array) -> Array:
     """Compute the rotations (m, n + 1, 3, 3) of what joints 0 … n carry."""
-    turn = rotation_exp(axes * away[..., None])
-    products = [np.broadcast_to(np.eye(3), turn[:, 0].shape)]
-    for joint in range(turn.shape[1]):
-        products.append(products[-1] @ turn[:, joint])
+    return _accumulated(rotation_exp(axes * away[..., None]))
+
+
+def _accumulated(steps: Array) -> Array:
+    """Multiply the first 0 … n of the matrices (m, n, k, k) from the left on: (m, n + 1, k, k)."""
+    products = [np.broadcast_to(np.eye(steps.shape[-1]), steps[:, 0].shape)]
+    for joint in range(steps.shape[1]):
+        products.append(products[-1] @ steps[:, joint])
     return np.stack(products, axis=1)
 
 

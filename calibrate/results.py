@@ -198,7 +198,7 @@ class Posterior(msgspec.Struct, frozen=True, omit_defaults=True):
     arm: LearnedArm | None = None
     """None: the joints were not recorded, or the arm's errors are not in `errors`."""
     stated_arm_error: tuple[tuple[float, ...], ...] | None = None
-    """Covariance (6, 6) of X by the stated error of the robot: one in the fit, another in every check."""
+    """Covariance (6, 6) of X by the robot's stated error: one in the fit, another in checks elsewhere."""
     level: tuple[float, ...] | None = None
     """Mean direction of gravity in the flange, to which X belongs; None: no bracket's bend in `errors`."""
     flange_extent_m: tuple[float, ...] | None = None

@@ -139,7 +139,8 @@ def find_shift(views: ViewSet, known: KnownCell) -> DriftCheck:
     evidence = _without_board(data, Layout.of(found.state))
     away = prior.away(found.state)
     evidence = Quadratic(evidence.N, evidence.right + evidence.N @ away)
-    by = _Shift(known, prior)
+    # Where the calibration's views were, the arm errs as it did then; elsewhere it errs otherwise.
+    by = _Shift(known, prior, 2.0 * known.leaves_range(views) * known.stated_arm_error)
     shift, covariance = by.of(evidence)
     statistic = float(shift @ np.linalg.solve(covariance, shift))
     nu = known.freedom
@@ -187,6 +188,8 @@ class _Shift:
 
     known: KnownCell
     prior: KnownBefore
+    by_arm: Array
+    """(6, 6) covariance by what the arm errs at other postures than those of the calibration."""
 
     def of(self, evidence: Quadratic) -> tuple[Array, Array]:
         """Compute δ (6,) and its covariance (6, 6). X given θ is K θ, with what θ does not tell of it."""
@@ -195,8 +198,7 @@ class _Shift:
         K = self.known.covariance[:6, 6:] @ self.prior.information[6:, 6:]
         apart = np.concatenate([np.eye(6), -K], axis=1)
         alone = self.known.covariance[:6, :6] - K @ self.known.covariance[6:, :6]
-        stated = 2 * self.known.stated_arm_error  # of the postures of the fit, and of these
-        return apart @ mean, apart @ covariance @ apart.T + alone + stated
+        return apart @ mean, apart @ covariance @ apart.T + alone + self.by_arm
 
 
 def powers(covariance: Array, nu: float, false_alarm: float = FALSE_ALARM) -> tuple[float, float]:

@@ -117,7 +117,7 @@ def estimate(
             scales = solved.scales
             state = state.moved(solved.step, linear.board_step(solved))
             weights = corner_weights(observed, state, scales.sigma_px)
-            converged = is_settled(solved.step, solved.precision)
+            converged = bool(solved.step @ solved.precision @ solved.step < _SETTLED**2)
             linear = Linear.at(observed, state, weights)
         solved = linear.solve(priors.linearise(state, scales.arm_error_sigma), scales, "nothing")
         covariance = linear.covariance(solved)
@@ -138,11 +138,6 @@ def estimate(
         steps=steps,
         converged=converged,
     )
-
-
-def is_settled(step: Array, precision: Array) -> bool:
-    """Tell whether a step of all shared unknowns is short against their uncertainty."""
-    return bool(step @ precision @ step < _SETTLED**2)
 
 
 def corner_weights(observed: Observations, state: CellState, sigma_px: float) -> Array:

@@ -155,6 +155,16 @@ class KnownCell:
                 return read
         return None
 
+    def leaves_range(self, views: ViewSet) -> bool:
+        """Tell whether the flange's mean place is outside the ball that the fit's views filled, or may be.
+
+        The radius of an evenly filled ball is √(5/3) times the rms distance from its middle.
+        """
+        if self.flange_extent is None:
+            return True
+        away = views.base_from_flange[:, :3, 3].mean(axis=0) - self.flange_extent[:3]
+        return bool(np.linalg.norm(away) > np.sqrt(5 / 3) * self.flange_extent[3])
+
     def observe(self, views: ViewSet) -> Observations:
         """Observe new views with the errors of this arm and bracket; see `beside`."""
         observed = replace(observe_views(views), extent=self.extent)

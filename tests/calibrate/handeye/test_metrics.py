@@ -66,12 +66,6 @@ def test_each_direction_is_weighed_as_metres_where_the_board_is(direction):
     assert seen.weakest_sigma_m == pytest.approx(2e-3 if direction < 3 else 1e-3)
 
 
-def test_distance_in_sigmas():
-    covariance = np.diag([1e-6] * 3 + [1e-4] * 3)
-    X = pose(random_rotation(np.random.default_rng(4)), [1, 2, 3])
-    assert distance_in_sigmas(perturb(X, [3e-3, 0, 0, 0, 0.04, 0]), X, covariance) == pytest.approx(5.0)
-
-
 def test_pair_covariance_is_the_scatter_of_the_pair_solution():
     """Pairs share views: counting them as independent would claim a third of the true error."""
     squares = []

@@ -156,10 +156,9 @@ def test_numbers_that_measure_nothing_are_refused(wrong):
 
 
 def test_identical_views_are_refused():
-    view = make_cell(np.random.default_rng(0), 1, LOW).views.views[0]
+    views = make_cell(np.random.default_rng(0), 1, LOW).views
     with raises("poses-identical", CalibrationError):
-        cell = make_cell(np.random.default_rng(0), 1, LOW)
-        solve_views(replace(cell.views, views=(view,) * 8))
+        solve_views(replace(views, views=views.views * 8))
 
 
 @pytest.mark.parametrize("with_pixels", [True, False])

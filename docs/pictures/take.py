@@ -175,7 +175,7 @@ async def look(cameras: list[Camera], socket: Path) -> None:
             await photograph(cameras, socket)
             return
         camera = left[0]
-        camera.app = StationApp(Client(socket, "operator"))
+        camera.app = StationApp(Client(socket))
         camera.app.theme = f"station-{camera._theme}"
         async with camera.app.run_test(size=SIZES[camera._size]) as camera.pilot:
             await enter(left[1:])

@@ -120,10 +120,11 @@ def next_view(
     if found is None:  # as if the flange were the camera: how much is learned depends on its turns
         views, noise = _placed(as_views(mount, _usual_lens(camera), board, seen), board), USUAL_NOISE
         X = Y = np.eye(4)
+        counts = np.ones(len(views))
         flange = implied_flange(mount, X, Y, _boards(views))
     else:
         views, X, Y, noise = found.views, found.X, found.Y, found.noise
-        flange = views.base_from_flange
+        flange, counts = views.base_from_flange, found.fit.full
     lens, at, pool = views.camera, _boards(views), _candidates(views, board, given_up)
     prior = prior_information(lens, lens_known, BoardTolerance.of(board))
     free = None if lens_known else slice(12, 12 + len(intrinsics_names(lens)))
@@ -131,7 +132,7 @@ def next_view(
     objective = Objective("A", distance_m, prior, free)
     flange = np.concatenate([flange, implied_flange(mount, X, Y, pool)])
     each = view_information(mount, lens, flange, X, Y, points, noise)
-    known, gains = each[: len(at)].sum(axis=0), each[len(at) :]
+    known, gains = np.tensordot(counts, each[: len(at)], 1), each[len(at) :]
     best = int(np.argmin(objective(known + gains)))
     after_m = None if found is None else predicted_error_m(known + gains[best], prior, X, distance_m)
     return NextView(mount, board, lens, at, pool[best], found, after_m)

@@ -144,9 +144,9 @@ class StationApp(LivePageApp[None], DaemonApp):
         self.known = replace(self.known, status=status, gone="")
         if before is None or before.session.recording != status.session.recording:
             self.look_at_disk()
-        if before is not None and before.session.name and not status.session.name:
-            self.result_path = ""  # another session begins: what was looked at is no part of it
-        elif status.guidance.outline and before is not None and _one_more(before.session, status.session):
+        if before is not None and status.session.name not in ("", before.session.name):
+            self.result_path = ""  # another session began: what was looked at is no part of it
+        elif self.known.by_hand and before is not None and _one_more(before.session, status.session):
             self.bell()
         if before is None:  # connected, perhaps to another daemon than before
             self.known = replace(self.known, configuration=self.link.client.config)
@@ -256,8 +256,8 @@ class StationApp(LivePageApp[None], DaemonApp):
         """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
         if (status := self.known.live) is None:
             return
-        begins = status.state is not StationState.FREE_DRIVE
-        if status.guidance.outline and status.state in RUNNING:  # ends after the view that is being taken
+        begins = not self.known.by_hand
+        if not begins and status.state in RUNNING:  # ends after the view that is being taken
             await self.link.ask(verbs.Pause())
         elif await self.link.ask(verbs.Freedrive(begins)) is not None and begins:
             await self.switch_mode("capture")

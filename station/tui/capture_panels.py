@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from textual.content import Content
 
-from station.cell.status import DetectionStatus, GuidanceStatus
+from station.cell.status import DetectionStatus, GuidanceStatus, PoseStatus
 from station.tui.task import Known
 from station.tui.words import ERROR_SHOWN_MM, dim, error_facts, facts, limit_bar, lines, mark
 
@@ -67,8 +67,20 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:
         head += Content("  ") + mark("done" if estimate.enough else "todo", f"goal {goal:g} mm")
-    columns = [(p.estimated_sigma_mm or p.predicted_sigma_mm, bool(p.estimated_sigma_mm)) for p in poses]
-    return lines(head, *error_columns(columns, goal, width, height - 1))
+    return lines(head, *error_columns(errors_after(poses), goal, width, height - 1))
+
+
+def errors_after(poses: Sequence[PoseStatus]) -> list[tuple[float | None, bool]]:
+    """Return the predicted error after each pose (mm), and whether by images.
+
+    Planned with a usual noise, it is no larger than what the images showed before: views only add.
+    """
+    errors, shown_mm = list[tuple[float | None, bool]](), math.inf
+    for pose in poses:
+        shown_mm = pose.estimated_sigma_mm or shown_mm
+        planned_mm = pose.predicted_sigma_mm and min(pose.predicted_sigma_mm, shown_mm)
+        errors.append((pose.estimated_sigma_mm or planned_mm, bool(pose.estimated_sigma_mm)))
+    return errors
 
 
 def error_columns(

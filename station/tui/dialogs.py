@@ -18,6 +18,7 @@ from textual.widgets import Button, Input, Label, RichLog, Static
 from calibrate.files.install import reason_problem
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
+from station.protocol.verbs import Go
 from station.tui.frame import Question
 from station.tui.screen import Panel
 from station.tui.task import Action, Known
@@ -78,6 +79,12 @@ class ConfirmMotion(Confirm):
     def on_mount(self) -> None:
         self.set_interval(1.0, self._count_down)
         self._count_down()
+
+    def show(self, known: Known) -> None:
+        """Close where STOP, a fault or the daemon's end made an answer useless."""
+        super().show(known)
+        if known.live is None or known.live.state not in Go.states:
+            self.dismiss(False)
 
     def _count_down(self) -> None:
         left_s = max(0.0, self._until_s - time.monotonic())

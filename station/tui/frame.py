@@ -16,7 +16,7 @@ from textual.reactive import reactive
 from textual.screen import ModalScreen, Screen
 from textual.widgets import Footer, Static
 
-from station.cell.status import StationState, StationStatus
+from station.cell.status import StationStatus
 from station.protocol import verbs
 from station.protocol.states import LATCHED
 from station.protocol.verbs import Verb
@@ -252,13 +252,15 @@ class Framed(Screen[R]):
             shown, action = active.binding, active.binding.action
             if not self.does_something(action):
                 keys[key] = active._replace(binding=replace(shown, show=False))
-            elif action == "freedrive" and self.known.shown.state is StationState.FREE_DRIVE:
+            elif action == "freedrive" and self.known.by_hand:
                 keys[key] = active._replace(binding=replace(shown, description="End freedrive"))
         return keys
 
     def does_something(self, action: str) -> bool:
         """Tell whether the action of a key is possible now."""
         verb, status = ASKS.get(action), self.known.shown
+        if action == "freedrive" and self.known.by_hand:
+            return True
         if verb is not None and (status.state not in verb.states or (verb.moves and status.robot.by_hand)):
             return False
         return action not in NEEDS or bool(NEEDS[action](self.known))

@@ -12,6 +12,7 @@ from textual.content import Content
 from station.cell.status import PoseStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import MakePlan, Retake, Skip
+from station.tui.capture_panels import errors_after
 from station.tui.frame import Line
 from station.tui.progress import pose_mark
 from station.tui.screen import Box, Panel, Rows, StationScreen
@@ -29,9 +30,8 @@ NEW_PLAN = MakePlan(25, seed=1)
 POSE_VERBS = {"retake": Retake, "skip": Skip}
 
 
-def row_of(pose: PoseStatus) -> tuple[Content, ...]:
+def row_of(pose: PoseStatus, error_mm: float | None) -> tuple[Content, ...]:
     """Make a row of the table."""
-    error_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
     shown = f"{error_mm:6.2f}" if error_mm and error_mm <= ERROR_SHOWN_MM else f"{UNKNOWN:>6}"
     kind = pose_mark(pose)
     word: str = "saved" if pose.state == "done" else pose.state
@@ -52,7 +52,7 @@ def facts_line(known: Known) -> Content:
     session, goal_mm = known.shown.session, known.goal_mm
     if not (poses := session.poses):
         return dim(BY_HAND if known.shown.robot.by_hand else NO_PLAN)
-    end_mm = poses[-1].estimated_sigma_mm or poses[-1].predicted_sigma_mm
+    end_mm, _ = errors_after(poses)[-1]
     line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose")) + Content("   ")
     line += error_facts("predicted error at the end", end_mm, session.working_distance_m)
     if end_mm is not None and goal_mm is not None:
@@ -79,7 +79,9 @@ class PlanScreen(StationScreen):
 
     def show(self, known: Known) -> None:
         super().show(known)
-        self.table.show([row_of(pose) for pose in known.shown.session.poses])
+        poses = known.shown.session.poses
+        rows = [row_of(pose, mm) for pose, (mm, _) in zip(poses, errors_after(poses), strict=True)]
+        self.table.show(rows)
 
     def _cell(self, known: Known, width: int, height: int) -> Content:
         chosen = self.table.cursor_row if known.shown.session.poses else None

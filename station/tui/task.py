@@ -88,6 +88,11 @@ class Known:
         return bool(self.gone) or self.silent_s is not None
 
     @property
+    def by_hand(self) -> bool:
+        """Views are taken by hand, also while one is being saved."""
+        return self.shown.state is StationState.FREE_DRIVE or bool(self.shown.guidance.outline)
+
+    @property
     def blind(self) -> bool:
         """No picture is live: the status is old, or the camera gives no image."""
         return self.old or self.shown.detection.cause == NO_IMAGE
@@ -112,7 +117,7 @@ def steps(known: Known) -> tuple[Step, ...]:
     status = known.live
     if status is None:
         return tuple(Step(mode, "todo", UNKNOWN) for mode in STEPS)
-    made = [_connect(known, status), _plan(status), _capture(status), _result(known)]
+    made = [_connect(known, status), _plan(status), _capture(known, status), _result(known)]
     now = _now(made, status, known)
     return tuple(
         Step(step.mode, "now", step.text, step.brief)
@@ -126,7 +131,8 @@ def _now(made: list[Step], status: StationStatus, known: Known) -> int:
     if status.state in RUNNING or status.state in (StationState.PAUSED, StationState.FREE_DRIVE):
         return 2
     undone = [place for place, step in enumerate(made) if step.mark != "done"]
-    if known.result is not None and known.result.calibration is not None:
+    to_run = status.session.poses and not status.session.recording
+    if known.result is not None and known.result.calibration is not None and not to_run:
         return 3
     return undone[0] if undone else 3
 
@@ -150,12 +156,14 @@ def _plan(status: StationStatus) -> Step:
     return Step("plan", "done", many(len(poses), "pose"), str(len(poses)))
 
 
-def _capture(status: StationStatus) -> Step:
+def _capture(known: Known, status: StationStatus) -> Step:
     session, state = status.session, status.state
     count = f"{session.captured} of {len(session.poses)}"
     brief = f"{session.captured}/{len(session.poses)}"
     if state in (StationState.STOPPED, StationState.FAULT):
         return Step("capture", "stopped", f"{state.value} at {count}", brief)
+    if known.by_hand:
+        return Step("capture", "now", f"{many(session.captured, 'view')} by hand", str(session.captured))
     if not session.poses:
         return Step("capture", "todo", "not begun" if status.robot.by_hand else "after plan")
     if session.recording:
@@ -227,10 +235,10 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     if status.guidance.outline and state in (*RUNNING, StationState.FREE_DRIVE):
         return _by_hand(status)
     if state in RUNNING:
-        good = " Good enough already: F7 finishes." if status.estimate.enough else ""
+        good = "Good enough already: F7 finishes. " if status.estimate.enough else ""
         failed = [pose for pose in status.session.poses if pose.state == "failed"]
         lost = f"{many(len(failed), 'pose')} failed: {failed[-1].reason}" if failed else ""
-        why = status.pending or status.reason or lost or f"F12 stops it at once, F6 after this pose.{good}"
+        why = status.pending or status.reason or lost or f"{good}F12 stops it at once, F6 after this pose."
         return Action("", "Watch the arm", why)
     if state is StationState.SEALING:
         return Action("", "Wait", "The recording is being finished.")

@@ -128,6 +128,10 @@ class ThemedApp(App[R]):
         if self.no_color:
             self._filters.append(NoColour())
 
+    def action_help_quit(self) -> None:
+        """Answer Ctrl-C, which stops the arm in a shell, but not here."""
+        self.notify("F12 stops the arm. Ctrl-Q closes this screen.")
+
     def get_theme_variable_defaults(self) -> dict[str, str]:
         """Return values for the names of colours while Textual starts in a theme of its own."""
         return _DARK

@@ -12,7 +12,10 @@ from textual.content import Content
 from calibrate.files.formatting import predicted_error
 from station.cell.status import StationState, StationStatus
 
-STATE_WORDS = {state: state.value.upper() for state in StationState} | {StationState.DISCONNECTED: "NO ROBOT"}
+STATE_WORDS = {state: state.value.upper() for state in StationState} | {
+    StationState.DISCONNECTED: "NO ROBOT",
+    StationState.FREE_DRIVE: "FREEDRIVE",
+}
 
 Mark = Literal["done", "now", "stopped", "look", "failed", "todo"]
 MARKS: dict[Mark, tuple[str, str]] = {

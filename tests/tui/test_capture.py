@@ -9,7 +9,7 @@ import pytest
 from calibrate.geometry import pose as pose_of
 from station.cell.config import matrix4
 from station.cell.status import ArmCondition, EstimateStatus, PoseStatus, StationState
-from station.tui.capture_panels import coverage_lines, error_columns, error_lines
+from station.tui.capture_panels import coverage_lines, error_columns, error_lines, errors_after
 from station.tui.progress import chips, pose_line
 from station.tui.stopped import stopped_text
 from station.tui.task import Known
@@ -70,12 +70,14 @@ def test_the_error_falls_towards_its_goal() -> None:
             index=i,
             name=f"p{i}",
             predicted_sigma_mm=4 / (i + 1),
-            estimated_sigma_mm=5 / (i + 1) if i < 6 else None,
+            estimated_sigma_mm=0.5 / (i + 1) if i < 6 else None,
         )
         for i in range(25)
     )
     estimate = EstimateStatus(6, predicted_error_mm=0.83, working_distance_m=0.5)
     status = msgspec.structs.replace(in_session(idle(), poses=poses), estimate=estimate)
+    falling = [error_mm for error_mm, _ in errors_after(poses)]
+    assert falling == sorted(falling, reverse=True), "more views make nothing worse"
     lines = error_lines(Known(status, configuration=CELL), 60, 14).plain.split("\n")
     assert all(said in lines[0] for said in ("0.83 mm", "500 mm", "goal 1 mm")) and "✓" not in lines[0]
     assert len(lines) == 14

@@ -27,7 +27,7 @@ from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
-from tests.tui.conftest import FakeLink, app_on, idle, opened, said, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
 
 GOOD = calibration_of(
     TRUTH, RobotIdentity(serial="1", model="UR10"), CameraIdentity(serial="2", model="camera")
@@ -170,6 +170,10 @@ async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready
         told = text_of(pilot.app, "#verdict")
         assert "PASS WITH A REASON, installs only with a reason" in told
         assert "Regression" in told
+        link.show(in_session(idle(), name=""))  # a plan is loaded, no other session began
+        await until(pilot, lambda: not pilot.app.known.shown.session.name)
+        await pilot.pause(0.1)
+        assert text_of(pilot.app, "#verdict") == told
 
 
 @pytest.mark.parametrize("state", [StationState.IDLE, StationState.PAUSED, StationState.MOVING])

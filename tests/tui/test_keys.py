@@ -34,6 +34,14 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
         assert "84 mm and 22° to pose 1" in facts and "0.22 m/s" in facts
         warning = next(i for i, line in enumerate(facts.splitlines()) if line.startswith("WARNING"))
         assert facts.splitlines()[warning + 1].startswith(" " * 10 + "0")  # a long fact goes on below itself
+        for ends in (idle(StationState.STOPPED), None):
+            link.show(ends)
+            await until(pilot, lambda: not isinstance(pilot.app.screen, ConfirmMotion))
+            link.show(idle())
+            await until(pilot, lambda: pilot.app.known.live and pilot.app.known.live.state is StationState.IDLE)
+            await pilot.press("f5")
+            await until(pilot, lambda: pilot.app.screen.query("#yes"))
+        await until(pilot, lambda: pilot.app.screen.query_one("#yes").region)
         await pilot.click("#yes")
         await until(pilot, lambda: verbs.Go("t-1", SUMMARY.approval_sha256) in link.asked)
         await until(pilot, lambda: pilot.app.current_mode == "capture")  # where the work is watched

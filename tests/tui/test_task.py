@@ -22,7 +22,7 @@ from station.cell.status import (
 )
 from station.protocol.verbs import Check
 from station.tui.dialogs import Confirm, ConfirmMotion, Reason
-from station.tui.frame import StopBlock, bar_line, next_line, rail_line
+from station.tui.frame import Question, StopBlock, bar_line, next_line, rail_line
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from tests.recordings.small_recording import make_state
 from tests.tui.conftest import SUMMARY, FakeLink, idle, in_session, opened, said, text_of, until, with_robot
@@ -181,7 +181,8 @@ async def test_stop_stands_whole_on_every_screen_and_question(
             assert pilot.app.screen.query_one(StopBlock).latched
             link.show(idle())
             await until(pilot, lambda: "IDLE" in text_of(pilot.app, "#bar"))
-            await pilot.app.pop_screen()
+            if isinstance(pilot.app.screen, Question):  # STOP made the approval of a motion useless
+                await pilot.app.pop_screen()
 
 
 @pytest.mark.parametrize("state", [StationState.IDLE, StationState.PAUSED])

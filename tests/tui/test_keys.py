@@ -38,7 +38,7 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
             link.show(ends)
             await until(pilot, lambda: not isinstance(pilot.app.screen, ConfirmMotion))
             link.show(idle())
-            await until(pilot, lambda: pilot.app.known.live and pilot.app.known.live.state is StationState.IDLE)
+            await until(pilot, lambda: "IDLE" in text_of(pilot.app, "#bar"))
             await pilot.press("f5")
             await until(pilot, lambda: pilot.app.screen.query("#yes"))
         await until(pilot, lambda: pilot.app.screen.query_one("#yes").region)

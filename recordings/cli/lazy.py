@@ -8,6 +8,7 @@ import io
 import os
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
 
@@ -152,7 +153,10 @@ def run(name: str, group: LazyGroup) -> None:
 
         completion.completion_init()  # type: ignore[attr-defined]
     try:
-        group(prog_name=name)
+        try:
+            group(prog_name=name)
+        finally:
+            sys.stdout.flush()  # not at the very end of Python, which has another exit code
     except ModuleNotFoundError as missing:
         package = (missing.name or "").partition(".")[0]
         if package not in _EXTRAS:
@@ -169,12 +173,19 @@ def run(name: str, group: LazyGroup) -> None:
         sys.exit(problem.exit_code)
     except OSError as problem:  # a folder that may not be written, a full disk behind stdout
         where = problem.filename or "the output"
-        print(plain_text(f"{name}: {where}: {problem.strerror or problem}"), file=sys.stderr)
+        if not isinstance(problem, BrokenPipeError):  # `| head` has read enough
+            print(plain_text(f"{name}: {where}: {problem.strerror or problem}"), file=sys.stderr)
+        with suppress(OSError):
+            sys.stdout.close()  # what it still holds would fail once more
         sys.exit(1)
 
 
 def print_what_it_can() -> None:
-    """Print ? for letters that the terminal's encoding lacks (°, σ, ✓ in Latin-1), instead of failing."""
+    """Print ? for letters that the terminal's encoding lacks (°, σ, ✓ in Latin-1), instead of failing.
+
+    A program that was started without stdout (`>&-`) works, and prints nothing.
+    """
+    sys.stdout = sys.stdout or Path(os.devnull).open("w")  # noqa: SIM115  (for good)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
@@ -38,3 +39,17 @@ def test_a_missing_extra_is_named_in_one_line() -> None:
     )
     assert done.returncode == 2
     assert "calibration-station[station]" in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "words", ["recordings info FILE", "recordings info FILE --json", "calibrate board -o x.png"]
+)
+@pytest.mark.parametrize(("closed", "code", "lines"), [(">&-", 0, 0), ("> /dev/full", 1, 1)])
+def test_a_closed_or_full_output_is_no_defect(
+    small: Path, tmp_path: Path, words: str, closed: str, code: int, lines: int
+) -> None:
+    program, *rest = words.replace("FILE", str(small)).split()
+    line = f'"{sys.executable}" -m {program}.cli {" ".join(rest)} {closed}'
+    asked = os.environ | {"PYTHONUNBUFFERED": ""}
+    done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, env=asked)
+    assert (done.returncode, len(done.stderr.splitlines())) == (code, lines), done.stderr

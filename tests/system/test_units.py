@@ -49,6 +49,8 @@ def test_exposure_stays_below_the_limit(scratch: Path, unit: str) -> None:
 def test_unit_is_valid(scratch: Path, unit: str, tmp_path: Path) -> None:
     text = (scratch / "etc/systemd/system" / unit).read_text()
     assert "@PREFIX@" not in text
+    (page,) = re.findall(r"^Documentation=file:(.+)$", text, re.MULTILINE)
+    assert (scratch / page.lstrip("/")).is_file()
     # verify looks for the program on this machine: the stand-in takes its place.
     standing_in = text.replace("/usr/local/bin", str(scratch / "usr/local/bin"))
     path = tmp_path / "verify" / unit

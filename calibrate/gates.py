@@ -1,9 +1,10 @@
 """Gates: named conditions that a calibration must meet before it may be installed.
 
-A gate is, under one name, a limit in `GateLimits` and a figure that `_measured` yields of the solution,
-with title, unit and remedy. A new figure is a field of `handeye.solution.Solution`, filled in
-`handeye.solve`, for the default profile and the paper's. A gate without a value has a function of its own
-that `judge` calls, such as `_session_gate`.
+A gate is, under one name, a limit in `GateLimits`, whose text says when it closes, and a figure that
+`_measured` yields of the solution, with title, unit and remedy. Terminal, screen, report, `--json`, the file
+of limits and docs/reference/gates.md take all gates from here. A new figure is a field of
+`handeye.solution.Solution`, filled in `handeye.solve`, for the default profile and the paper's. A gate
+without a value has a function of its own that `judge` calls, such as `_session_gate`.
 """
 
 from __future__ import annotations
@@ -19,39 +20,45 @@ from calibrate.results import Gate, Sense
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Limits of the gates, by their ids, as written in a limits file; None switches a gate off."""
+    """Limits of the gates, by their ids, as written in a limits file; None switches a gate off.
+
+    The text below a limit says when its gate closes.
+    """
 
     views: int | None = 8
+    """Fewer views were used."""
     weight: float | None = 0.8
-    """Smallest mean weight of the views: below it too many were rejected or down-weighted."""
+    """The mean weight of the views is smaller: too many were rejected or count for little."""
     session: bool | None = True
-    """No other reading of the recording (inverted poses, other square size, …) explains it better."""
+    """Another reading of the whole recording (inverted poses, other square size …) explains it better."""
     arm: Literal["warn", "fail"] | None = "warn"
-    """What becomes of a stated error that holds of the arm's own only what varies smoothly with its place: no
-    joints, model or accuracy are known."""
+    """`fail`: the stated error lacks what an arm does unsmoothly, as no joints, model or accuracy are
+    known."""
     rotation_deg: float | None = 30.0
-    """Smallest allowed value of the largest rotation between two views."""
+    """No two views are rotated this far against each other."""
     axis_spread: float | None = 0.1
-    """Smallest spread of the rotation axes; 0: all about one axis, 1: all axes alike."""
+    """All rotations are about nearly one axis (0: all about one, 1: all axes alike)."""
     view_rms_px: float | None = 1.5
-    """Largest of the views' rms reprojection errors."""
+    """The rms reprojection error of some view is larger."""
     holdout_share: float | None = 0.01
-    """Held-out translation error over the working distance."""
+    """Held-out views miss by more than this share of the working distance."""
     cross_validation: float | None = 1.0
-    """Cross-validated over predicted error, as a multiple of the largest ratio that chance explains."""
+    """Left-out views are missed by more than the predicted error allows by chance."""
     predicted_error_m: float | None = 0.002
-    """1σ of a point at the working distance."""
+    """A point at the working distance is expected to be off by more (1σ)."""
     coverage: float | None = 0.25
-    """Share of the image inside the outlines of all boards, where the intrinsics were estimated here."""
+    """The intrinsics were estimated here, and all boards together cover a smaller share of the image."""
     lens_pull: float | None = 1.0
-    """Shift of X caused by the given intrinsics, beyond their tolerance, over its error without an arm's."""
+    """Given intrinsics shift X, beyond their tolerance, by more than its error without an arm's."""
     board_pull: float | None = 1.0
-    """The same for the stated board: size, print and flatness."""
+    """The stated board (size, print, flatness) does the same."""
     clock_bound_s: float | None = 0.02
-    """Largest uncertainty of image time against robot time. An arm counts as settled below 2 mrad/s, so this
-    is at most 0.04 mm at one metre."""
+    # An arm counts as settled below 2 mrad/s: in 0.02 s at most 0.04 mm at one metre.
+    """Image and robot pose may be further apart in time."""
     robot_error_m: float | None = 0.002
+    """The robot's positions are noisier."""
     robot_error_deg: float | None = 0.3
+    """Its orientations are noisier."""
 
 
 def judge(

@@ -22,6 +22,8 @@ MADE = {
     "reference/cli": "cli",
     "reference/configuration": "structs configuration",
     "reference/errors": "errors",
+    "reference/formats": "tables formats",
+    "reference/gates": "tables gates",
     "reference/json": "structs json",
     "reference/protocol": "protocol",
 }

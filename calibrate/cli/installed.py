@@ -29,7 +29,7 @@ Root = Annotated[
     Path | None,
     typer.Option("--root", help="State folder (default: $STATE_DIRECTORY or the XDG state folder)"),
 ]
-_FORMATS_HELP = "; ".join(f"{name}: {kind.says}" for name, kind in FORMATS.items())
+_FORMATS_HELP = "; ".join(f"{name}: {kind.help}" for name, kind in FORMATS.items())
 FormatName = StrEnum("FormatName", {name.replace("-", "_"): name for name in FORMATS})  # type: ignore[misc]
 _TOLD_OF_OLD = (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN)
 CameraName = Annotated[str, typer.Option("--camera", help="Name of the camera, in a cell with several")]

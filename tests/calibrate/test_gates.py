@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -149,17 +148,6 @@ def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) ->
         read_limits(path)
     with raises("input-file", UsageError):
         read_limits(tmp_path / "none.yaml")
-
-
-def test_the_documented_defaults_are_those_in_force() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "integrator" / "calibration-file.md").read_text()
-    table = text[text.index("## Gates") : text.index("Installing asks one more")]
-    documented: dict[str, str] = {}
-    for row in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", table, re.MULTILINE):
-        documented |= zip(re.findall(r"`(\w+)`", row[0]), row[1].strip().split(", "), strict=True)
-    assert documented == {
-        name: f"{v}".lower() if isinstance(v, bool | str) else f"{v:g}" for name, v in DEFAULTS.items()
-    }
 
 
 def test_an_error_without_the_arm_s_own_is_a_warning_unless_the_integrator_says_more(

@@ -12,14 +12,20 @@ from numpy.typing import ArrayLike
 
 from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration, CorrectedArm
+from calibrate.files.exports.formats import export_format
 from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment
 from calibrate.files.integrity import content_sha256
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
 from calibrate.kinematics import URDF_LINKS, URDF_ORIGIN, DhTable, link_frames
 
 
+@export_format(".urdf", "attached")
 def urdf(calibration: Calibration, frames: FrameNames) -> str:
-    """Make a complete URDF: the robot's frame and the camera, or the driver's frame that carries it."""
+    """Links of the camera's body and its optical frame.
+
+    Place: maps points of the body (x ahead, z up), or of the frame that `--attach` names, into the robot's,
+    then of the optical frame into the body's; metres, rpy about fixed axes. With `--arm`: your arm's file.
+    """
     parent = frames.parent(calibration)
     name = quoteattr(f"{frames.node}_calibrated")
     return (
@@ -88,8 +94,13 @@ def table_of(calibration: Calibration) -> CorrectedArm:
     return calibration.arm_table
 
 
+@export_format(".yaml", "named")
 def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
-    """Make the `kinematics_params_file` of ROS 2's ur_description: x y z, roll pitch yaw of each link."""
+    """The corrected arm, for ROS 2's ur_description.
+
+    Of a UR only: the `kinematics_params_file`, each link's place in metres and rpy about fixed axes, and in
+    its comment the camera pose that belongs to it.
+    """
     arm = table_of(calibration)
     table, X = arm.installable()
     if table is None:

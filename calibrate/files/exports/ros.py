@@ -5,13 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.files.calibration import Calibration
+from calibrate.files.exports.formats import export_format
 from calibrate.files.exports.frames import FrameNames, comment, commented_yaml
 from calibrate.geometry import Array, quaternion_from_matrix
 from calibrate.projection import camera_matrix, distortion
 
 
+@export_format(".yaml")
 def ros_camera_info(calibration: Calibration, frames: FrameNames) -> str:
-    """Make a ROS camera_info YAML, keys in the order of camera_calibration_parsers."""
+    """The intrinsics, as a camera_info YAML.
+
+    Lens: plumb_bob, rational_polynomial or equidistant; the middle of the top left pixel is (0, 0). Keys in
+    the order of camera_calibration_parsers.
+    """
     camera = calibration.intrinsics.model
     K, D = camera_matrix(camera), distortion(camera)
     plain = {
@@ -43,7 +49,13 @@ def _publisher_arguments(calibration: Calibration, frames: FrameNames) -> list[s
     return [*found, "--frame-id", parent, "--child-frame-id", child]
 
 
+@export_format(".launch.py", "attached")
 def ros_launch(calibration: Calibration, frames: FrameNames) -> str:
+    """The transform, as a ROS 2 launch file that publishes it.
+
+    Place: maps points of the optical frame, or of the frame that `--attach` names, into the robot's; metres,
+    quaternion x y z w.
+    """
     listed = ",\n".join(f"                {part!r}" for part in _publisher_arguments(calibration, frames))
     return f'''# {comment(calibration, frames, attachable=True)}
 from launch import LaunchDescription

@@ -6,13 +6,19 @@ import cv2
 import numpy as np
 
 from calibrate.files.calibration import Calibration
+from calibrate.files.exports.formats import export_format
 from calibrate.files.exports.frames import FrameNames, comment, commented_yaml
 from calibrate.geometry import inverse, roll_pitch_yaw
 from calibrate.projection import camera_matrix, distortion
 
 
+@export_format(".yml")
 def opencv(calibration: Calibration, frames: FrameNames) -> str:
-    """Make an OpenCV FileStorage YAML; the transform's node is named by its frames."""
+    """Transform and intrinsics, as a FileStorage YAML.
+
+    Place: maps points of the optical frame into the robot's; metres, 4 × 4, the node is named by the frames.
+    Lens: distortion in OpenCV's order; the middle of the top left pixel is (0, 0).
+    """
     camera = calibration.intrinsics.model
     storage = cv2.FileStorage(
         "memory.yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
@@ -31,18 +37,24 @@ def opencv(calibration: Calibration, frames: FrameNames) -> str:
     return storage.releaseAndGetString()
 
 
+@export_format(".yaml")
 def zivid(calibration: Calibration, frames: FrameNames) -> str:
-    """Write for `zivid.Matrix4x4(path)`: millimetres, the camera's pose in the robot's frame."""
+    """The transform, as a Matrix4x4 in mm.
+
+    Place: maps points of the optical frame into the robot's; **millimetres**, 4 × 4, for `zivid.Matrix4x4`.
+    """
     matrix = calibration.transform.matrix.copy()
     matrix[:3, 3] *= 1000
     plain = {"__version__": {"serializer": 1, "data": 1}, "FloatMatrix": {"Data": matrix.tolist()}}
     return commented_yaml(calibration, frames, plain, default_flow_style=None, width=120)
 
 
+@export_format(".dat")
 def halcon(calibration: Calibration, frames: FrameNames) -> str:
-    """Write for `read_pose`, as calibrate_hand_eye gives it: tool_in_cam_pose or base_in_cam_pose.
+    """The pose, as tool_in_cam_pose or base_in_cam_pose.
 
-    Metres and degrees; representation 0, create_pose's usual one, is 'Rp+T', 'gba', 'point': R = Rx Ry Rz.
+    Place: maps points of the robot's frame into the **optical frame**, for `read_pose`, as calibrate_hand_eye
+    gives it. Metres and degrees; type 0, usual in create_pose: `Rp+T`, `gba`, `point`, so R = Rx Ry Rz.
     """
     matrix = inverse(calibration.transform.matrix)
     name = "tool_in_cam_pose" if calibration.mount == "eye-in-hand" else "base_in_cam_pose"

@@ -7,7 +7,6 @@ and exported like it.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -30,24 +29,15 @@ from recordings.writer import RecordingWriter, derived_recording
 USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)
 MAGNIFIED = 50.0
 """Residuals are drawn so many times longer."""
-_FEWEST_VIEWS = 1
-
-
-@dataclass(frozen=True, eq=False)
-class ViewResidual:
-    """Reprojection error of one view by robot pose, camera pose and board pose."""
-
-    index: int
-    rms_px: float | None
-    """None where no board was seen."""
-    rejected: str
-    """Reason; empty = used."""
 
 
 def annotate(
     recording: Recording, calibration: Calibration, output: Path, progress: Progress | None = None
-) -> list[ViewResidual]:
-    """Write `output` (.mcap), which must not exist. CalibrationError or RecordingError."""
+) -> dict[int, float | None]:
+    """Write `output` (.mcap), which must not exist. CalibrationError or RecordingError.
+
+    Returns each view's rms reprojection error by robot, camera and board pose, px; None: no board was seen.
+    """
     camera, info = calibration.intrinsics.model, recording.info
     if (camera.width, camera.height) != (info.camera.width, info.camera.height):
         raise CalibrationError(
@@ -57,26 +47,25 @@ def annotate(
         )
     if calibration.mount != info.mount:
         raise CalibrationError("not-of-recording", calibrated=calibration.mount, recorded=info.mount)
-    seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
+    seen = load_views(recording, calibration.board, camera, progress, fewest=1).detections
     rejected = {view.index: view.reason for view in calibration.views.rejected}
-    marks: list[list[Marks]] = []
-    found: list[ViewResidual] = []
+    drawn: list[tuple[list[Marks], str]] = []
+    rms_px: dict[int, float | None] = {}
     for view in recording.views():
         why = rejected.get(view.index, "")
-        of_view, rms_px = _marks(calibration, view.base_from_flange, seen.get(view.index), bool(why))
-        marks.append(of_view)
-        found.append(ViewResidual(view.index, rms_px, why))
+        marks, rms = _marks(calibration, view.base_from_flange, seen.get(view.index), bool(why))
+        drawn.append((marks, _text(view.index, rms, why)))
+        rms_px[view.index] = rms
     with derived_recording(output, msgspec.structs.replace(info, part=1)) as writer:
         writer.attach("calibration.yaml", "application/yaml", encode_calibration(calibration))
         writer.camera_model(camera)
         for place in (calibration.result, calibration.board_place):
             T: Matrix4 = tuple(tuple(map(float, row)) for row in place.transform.matrix)
             writer.frame(place.parent_frame, place.child_frame, T)
-        copies = _copied(recording, writer)
-        for image, of_view, residual in zip(copies, marks, found, strict=True):
-            writer.marks(image.sequence, of_view, _text(residual))
+        for image, (marks, text) in zip(_copied(recording, writer), drawn, strict=True):
+            writer.marks(image.sequence, marks, text)
         writer.finish()
-    return found
+    return rms_px
 
 
 def _copied(recording: Recording, writer: RecordingWriter) -> Iterator[Image]:
@@ -128,10 +117,6 @@ def _marks(
     return [corners, towards], float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def _text(view: ViewResidual) -> str:
-    said = (
-        "no board seen"
-        if view.rms_px is None
-        else f"{view.rms_px:.2f} px RMS, lines {MAGNIFIED:.0f} times as long"
-    )
-    return f"pose {view.index + 1}: {said}" + (f", REJECTED: {view.rejected}" if view.rejected else "")
+def _text(index: int, rms_px: float | None, rejected: str) -> str:
+    said = "no board seen" if rms_px is None else f"{rms_px:.2f} px RMS, lines {MAGNIFIED:.0f} times as long"
+    return f"pose {index + 1}: {said}" + (f", REJECTED: {rejected}" if rejected else "")

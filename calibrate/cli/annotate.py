@@ -25,6 +25,7 @@ def annotate(
     """
     source = open_recording(recording)
     with detection_progress() as progress:
-        found = draw(source, read_calibration(calibration), output, progress)
-    rejected = [view.index + 1 for view in found if view.rejected]
+        drawn = read_calibration(calibration)
+        found = draw(source, drawn, output, progress)
+    rejected = [view.index + 1 for view in drawn.views.rejected if view.index in found]
     out.print(f"{output}: {len(found)} views" + (f", rejected: {rejected}" if rejected else ""))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import msgspec
 import typer
@@ -85,22 +87,24 @@ def drift_check(
         prepared = prepare_views(
             recording, options, progress, fewest=1 if production else FEWEST_FOR_DRIFT_CHECK
         )
-    info, noted = prepared.recording.info, None if held is None else _Noted(root, camera, held.version)
+    info = prepared.recording.info
+    note = None if held is None else partial(note_check, root, camera=camera, version=held.version)
     own, trend, validity, before, unnoted = False, None, None, list[bool](), None
     if production:
         result = _check_pictures(source, prepared, calibration)
         text = production_text(result, len(prepared.views))
     else:
-        _require_this_cell(source, info, calibration, root, noted)
+        _require_this_cell(source, info, calibration, root, note)
         result = check_drift(prepared.views, calibration, prepared.loaded.board)
         text = check_text(result, calibration)
         own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
     try:
-        if noted is not None and production and not result.passed:  # no alarm is no proof
-            validity = _judge(noted, result, source.name, datetime.now(UTC))
-        elif noted is not None and not production and not own:
-            validity = _judge(noted, result, info.name, _taken(info))
-            before, trend = _log(noted, result, calibration, info, prepared.loaded.board)
+        if note is not None and production and not result.passed:  # no alarm is no proof
+            validity = note(*_judged(result, source.name), datetime.now(UTC))
+        elif note is not None and held is not None and not production and not own:
+            validity = note(*_judged(result, info.name), _taken(info))
+            board_now = prepared.loaded.board
+            before, trend = _log(result, calibration, info, board_now, root, camera, held.version)
     except InstallError as problem:
         if problem.code == "other-version":
             raise
@@ -129,27 +133,6 @@ def drift_check(
         raise typer.Exit(CalibrationError.exit_code)
 
 
-class _Noted(NamedTuple):
-    """The installed version of a camera, which the check judges."""
-
-    root: Path | None
-    camera: str
-    version: int
-
-    def judge(self, reason: ValidityReason, passed: bool, proves: bool, when: datetime) -> Validity:
-        """Record what follows for it; `proves` and `when` as in `Validity.after_check`."""
-        return note_check(
-            self.root,
-            "drift-check",
-            reason,
-            passed=passed,
-            proves=proves,
-            when=when,
-            camera=self.camera,
-            version=self.version,
-        )
-
-
 def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibration) -> DriftCheck:
     mount = prepared.recording.info.mount
     if mount != calibration.mount:
@@ -158,19 +141,25 @@ def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibrat
 
 
 def _log(
-    noted: _Noted, result: DriftCheck, calibration: Calibration, info: SessionInfo, looked_at: BoardSpec
+    result: DriftCheck,
+    calibration: Calibration,
+    info: SessionInfo,
+    looked_at: BoardSpec,
+    root: Path | None,
+    camera: str,
+    version: int,
 ) -> tuple[list[bool], Trend | None]:
     """Log the check: results of the earlier ones of the same solve, and the trend with it.
 
     A touch test makes a version of the same solve.
     """
-    versions = installed_versions(noted.root, noted.camera)
-    solve = {version.number for version in versions if same_solve(calibration, version.calibration)}
-    before = [entry for entry in read_checks(noted.root, noted.camera) if entry.generation in solve]
+    versions = installed_versions(root, camera)
+    solve = {known.number for known in versions if same_solve(calibration, known.calibration)}
+    before = [entry for entry in read_checks(root, camera) if entry.generation in solve]
     board = None if looked_at == calibration.board else looked_at
-    entry = entry_of(result, _taken(info).timestamp(), noted.version, info.name, board)
+    entry = entry_of(result, _taken(info).timestamp(), version, info.name, board)
     trend = find_trend([*before, entry], known_cell(calibration, board), board)
-    append_check(msgspec.structs.replace(entry, trend=trend), noted.root, noted.camera)
+    append_check(msgspec.structs.replace(entry, trend=trend), root, camera)
     return [one.passed for one in before], trend
 
 
@@ -179,8 +168,8 @@ def _taken(info: SessionInfo) -> datetime:
     return datetime.fromtimestamp(info.created_wall_ns / 1e9 or time.time(), UTC)
 
 
-def _judge(noted: _Noted, result: DriftCheck, recording: str, taken: datetime) -> Validity:
-    """Let the check put the installed calibration in doubt, or clear it."""
+def _judged(result: DriftCheck, recording: str) -> tuple[ValidityReason, bool, bool]:
+    """Give reason, `passed` and `proves` of a check, as `note_check` takes them."""
     verdict = "PASS" if result.passed else "FAIL"
     reason = ValidityReason(
         "drift-check",
@@ -194,21 +183,24 @@ def _judge(noted: _Noted, result: DriftCheck, recording: str, taken: datetime) -
             "power": round(result.power, 4),
         },
     )
-    proves = result.power >= POWER if result.passed else result.arm_known
-    return noted.judge(reason, result.passed, proves, taken)
+    return reason, result.passed, result.power >= POWER if result.passed else result.arm_known
 
 
 def _require_this_cell(
-    recording: Path, info: SessionInfo, calibration: Calibration, root: Path | None, noted: _Noted | None
+    recording: Path,
+    info: SessionInfo,
+    calibration: Calibration,
+    root: Path | None,
+    note: Callable[[ValidityReason, bool, bool, datetime], Validity] | None,
 ) -> None:
     """Refuse views of another cell; a session of this cell with another device doubts what is installed."""
     try:
         require_same_cell(str(recording), calibration, CellIdentity.of(info))
     except OtherCellError as other:
         own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
-        if noted is not None and own and other.device:
+        if note is not None and own and other.device:
             reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))
-            noted.judge(reason, False, True, _taken(info))
+            note(reason, False, True, _taken(info))
         raise
 
 

@@ -105,7 +105,8 @@ def solve(
         robot_accuracy_m=None if robot_accuracy_mm is None else robot_accuracy_mm / 1000,
         robot_accuracy_rad=None if robot_accuracy_deg is None else math.radians(robot_accuracy_deg),
     )
-    target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
+    name = recording.resolve().name  # `.` has none
+    target = output or Path(f"{name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target, "calibration")
     if opened and report is None:
         report = target.with_suffix(".html")

@@ -18,14 +18,11 @@ from calibrate.files.folders import (
     calibrations_folder,
     current_version,
     read_validity,
-    validity_of,
 )
 from calibrate.files.lines import append_line
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import (
-    WITHDRAWN_REMEDY,
-    CheckKind,
     Validity,
     ValidityReason,
     ValidityState,
@@ -162,15 +159,16 @@ def rollback(
     if reason.strip():
         _require_words(reason)
     folder = calibrations_folder(root, camera)
+    if to is None:
+        current_version(folder)  # raises first, so that no folder is created in vain
     with locked(folder):
         known = installed_versions(root, camera)
-        numbered = next((g for g in known if g.number == to), None)
-        target = before_current(known, read_log(root, camera)) if to is None else numbered
-        if target is None and to is None:
-            withdrawn = validity_of(folder, current_version(folder)[0]).state is ValidityState.WITHDRAWN
-            withdraw_it = f"To take it out of use: {_line(root, camera, 'withdraw', 'REASON')}"
-            advice = f"{WITHDRAWN_REMEDY}." if withdrawn else withdraw_it
-            raise InstallError("nothing-older", folder=folder, advice=advice)
+        if to is None:
+            target = before_current(known, read_log(root, camera))
+            if target is None:
+                raise InstallError("nothing-older", folder=folder, command=undo_line(root, camera))
+        else:
+            target = next((g for g in known if g.number == to), None)
         if target is None:
             have = ", ".join(str(g.number) for g in known) or "none"
             raise InstallError("no-such-version", folder=folder, generation=to, have=have)
@@ -192,12 +190,13 @@ def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Va
 def undo_line(root: Path | None = None, camera: str = MAIN_CAMERA) -> str:
     """Make the command that undoes the last installation: a rollback, or withdrawal where there is none."""
     older = before_current(installed_versions(root, camera), read_log(root, camera))
-    return _line(root, camera, *(["rollback"] if older else ["withdraw", "REASON"]))
+    other = "" if camera == MAIN_CAMERA else camera
+    return _line(root, other, *(["rollback"] if older else ["withdraw", "REASON"]))
 
 
 def _line(root: Path | None, camera: str, *words: str) -> str:
     where = [] if root is None else ["--root", str(root)]
-    named = [] if camera == MAIN_CAMERA else ["--camera", camera]
+    named = ["--camera", camera] if camera else []
     return shlex.join(["calibrate", *words, *where, *named])
 
 
@@ -236,18 +235,17 @@ def set_validity(
 
 def note_check(
     root: Path | None,
-    kind: CheckKind,
     reason: ValidityReason,
-    *,
     passed: bool,
     proves: bool,
     when: datetime,
+    *,
     camera: str = MAIN_CAMERA,
     version: int | None = None,
 ) -> Validity:
     """Record the validity after a check, by the rules of `Validity.after_check`; else as `set_validity`."""
     return _change_validity(
-        root, camera, version, lambda v: v.after_check(kind, passed, proves, when, reason, who())
+        root, camera, version, lambda v: v.after_check(reason, passed, proves, when, who())
     )
 
 
@@ -333,13 +331,10 @@ def install_line(
     source: Source, path: Path, root: Path | None = None, override: str = "", camera: str = ""
 ) -> str:
     """Make the command that installs a file of this source; only real ones go to the default root."""
-    kind = _CELL_OF[source]
-    words = ["calibrate", "install"]
-    words += [] if kind == "real" else ["--cell", kind]
-    words += [] if kind == "real" and root is None else ["--root", str(root or "ROOT")]
-    words += ["--camera", camera] if camera else []
-    words += ["--override", override] if override else []
-    return shlex.join([*words, str(path)])
+    words = ["install", str(path)]
+    if (kind := _CELL_OF[source]) != "real":
+        words, root = [*words, "--cell", kind], root or Path("ROOT")
+    return _line(root, camera, *words, *(["--override", override] if override else []))
 
 
 def _regression(calibration: Calibration, before: Calibration | None) -> list[Gate]:

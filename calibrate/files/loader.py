@@ -171,28 +171,26 @@ def watch(
     """
     folder = calibrations_folder(root, camera)
     ends_s = None if stop_s is None else time.monotonic() + stop_s
-    seen, version = _state(folder), 0
-    if first:
-        change, version = _look(root, camera, 0)
-        yield change
-    else:
-        version = seen[0] if isinstance(seen[0], int) else 0
-    while ends_s is None or time.monotonic() < ends_s:
-        time.sleep(poll_s)
+    seen = (0, "") if first else _state(folder)
+    version, _ = seen
+    while True:
         if (now := _state(folder)) != seen:
             seen = now
             change, version = _look(root, camera, version)
             yield change
+        if ends_s is not None and time.monotonic() >= ends_s:
+            return
+        time.sleep(poll_s)
 
 
-def _state(folder: Path) -> tuple[object, ...]:
-    """Version, validity state, since when and why; or the code of the error."""
+def _state(folder: Path) -> tuple[int, str]:
+    """Version, and its validity state, since when and why; or 0 and the code of the error."""
     try:
         number, _ = current_version(folder)
         held = validity_of(folder, number)
-        return number, held.state, held.since, held.reason.code
+        return number, f"{held.state} {held.since} {held.reason.code}"
     except CalibrationError as problem:
-        return (problem.code,)
+        return 0, problem.code
 
 
 def _look(root: Path | str | None, camera: str, before: int) -> tuple[InstallationChange, int]:

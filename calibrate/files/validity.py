@@ -12,14 +12,13 @@ import json
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Any
 
 from calibrate.errors import InstallError
 
 FILE = "validity.jsonl"
 LONGEST_AGE_DAYS = 36_500
 """A longer limit of the last proof's age is a slip."""
-CheckKind = Literal["drift-check", "touch-test"]
 WITHDRAWN_REMEDY = (
     "Solve a new recording and run `calibrate install FILE`, "
     "or `calibrate rollback NUMBER` to another version of `calibrate list`"
@@ -82,9 +81,9 @@ class Validity:
         return replace(self, state=ValidityState.IN_DOUBT, since=time_text(due), reason=reason)
 
     def after_check(
-        self, kind: CheckKind, passed: bool, proves: bool, when: datetime, reason: ValidityReason, who: str
+        self, reason: ValidityReason, passed: bool, proves: bool, when: datetime, who: str
     ) -> Validity:
-        """Return the validity after a check of kind `kind` on views taken at `when`.
+        """Return the validity after a check on views taken at `when`; the kind of check is `reason.code`.
 
         `proves`: a pass had enough power, or a failure could tell a camera's shift from other errors. Then a
         failure puts it in doubt and a pass makes it valid. Otherwise a failure makes it unverified, unless it
@@ -101,7 +100,7 @@ class Validity:
         if not passed:
             since = self.since if doubted else time_text(when)
             return replace(changed, state=ValidityState.IN_DOUBT, since=since)
-        if proves or (doubted and self.reason.code == kind):
+        if proves or (doubted and self.reason.code == reason.code):
             since = self.since if self.state is ValidityState.VALID else time_text(when)
             return replace(changed, state=ValidityState.VALID, since=since, verified=time_text(when))
         return replace(changed, state=ValidityState.UNVERIFIED) if doubted else self

@@ -279,7 +279,7 @@ def note_installed(
         )
         now = datetime.now(UTC)
         passed = all(map(agrees, touches))
-        validity = before.after_check("touch-test", passed, not passed, now, reason, who())
+        validity = before.after_check(reason, passed, not passed, now, who())
         return add_version(folder, calibration, "verify", validity, found)
 
 

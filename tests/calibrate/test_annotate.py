@@ -59,8 +59,8 @@ def test_a_wrong_calibration_is_seen(tmp_path: Path, solved: Path) -> None:
     recording = open_recording(SAMPLE)
     right = annotate(recording, good, tmp_path / "right.mcap")
     wrong = annotate(recording, shifted(good, 0.005), tmp_path / "wrong.mcap")
-    assert max(view.rms_px for view in right if view.rms_px is not None) < 1.0
-    assert min(view.rms_px for view in wrong if view.rms_px is not None) > 2.0
+    assert max(filter(None, right.values())) < 1.0
+    assert min(filter(None, wrong.values())) > 2.0
 
 
 def test_rejected_views_are_red_and_say_why(tmp_path: Path, solved: Path) -> None:
@@ -68,10 +68,7 @@ def test_rejected_views_are_red_and_say_why(tmp_path: Path, solved: Path) -> Non
     views = msgspec.structs.replace(
         calibration.views, rejected=[RejectedView(3, "pose-4", "robot pose is wrong")]
     )
-    found = annotate(
-        open_recording(SAMPLE), msgspec.structs.replace(calibration, views=views), tmp_path / "a.mcap"
-    )
-    assert [view.index for view in found if view.rejected] == [3]
+    annotate(open_recording(SAMPLE), msgspec.structs.replace(calibration, views=views), tmp_path / "a.mcap")
     colours = [
         marks.points[0].outline_color for _, marks in shown(tmp_path / "a.mcap", "/camera/annotations")
     ]

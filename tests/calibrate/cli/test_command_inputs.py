@@ -67,6 +67,7 @@ def test_nothing_installed_is_said(session_file: Path, tmp_path: Path) -> None:
     refused(run("drift-check", session_file, cwd=tmp_path), 1, "nothing-installed")
     refused(run("rollback", cwd=tmp_path), 1, "nothing-installed")
     refused(run("show", cwd=tmp_path), 1, "nothing-installed")
+    assert list(tmp_path.iterdir()) == [], "a slip in --root or --camera makes no folder"
 
 
 def test_a_check_of_the_wrong_kind_is_refused(session_file: Path, real_file: Path, tmp_path: Path) -> None:

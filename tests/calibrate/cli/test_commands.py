@@ -221,9 +221,11 @@ def test_a_session_of_this_cell_with_another_device_puts_what_is_installed_in_do
 
 
 def test_simulated_never_installs_on_a_real_cell(small_session_file: Path, tmp_path: Path) -> None:
-    run("solve", small_session_file, "-o", "c.yaml", cwd=tmp_path)
-    refused(run("install", "c.yaml", "--override", "x", cwd=tmp_path), 1, "other-cell")
-    refused(run("install", "c.yaml", "--cell", "simulated", cwd=tmp_path), 2, "root-missing", "--root")
+    shutil.copy(small_session_file, tmp_path)
+    run("solve", ".", cwd=tmp_path)
+    made = f"{tmp_path.name}.calibration.yaml"
+    refused(run("install", made, "--override", "x", cwd=tmp_path), 1, "other-cell")
+    refused(run("install", made, "--cell", "simulated", cwd=tmp_path), 2, "root-missing", "--root")
     assert not list((tmp_path / "state").rglob("*.yaml")), "the real cell's place is untouched"
 
 

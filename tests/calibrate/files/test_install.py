@@ -41,11 +41,9 @@ from tests.command_line import call
 def test_the_next_step_of_a_solve_is_one_that_works() -> None:
     assert install_line("real", Path("c.yaml")) == "calibrate install c.yaml"
     assert install_line("real", Path("my c.yaml")) == "calibrate install 'my c.yaml'"
-    again = install_line("simulated", Path("c.yaml"), Path("/r"), "REASON")
-    assert again == "calibrate install --cell simulated --root /r --override REASON c.yaml"
-    assert install_line("playback", Path("c.yaml")) == (
-        "calibrate install --cell simulated --root ROOT c.yaml"
-    )
+    again = install_line("playback", Path("c.yaml"), Path("/r"), "REASON")
+    assert again == "calibrate install c.yaml --cell simulated --override REASON --root /r"
+    assert "--root ROOT" in install_line("simulated", Path("c.yaml"))
 
 
 def test_what_undoes_an_install_is_named_and_works(make_file, tmp_path: Path) -> None:
@@ -62,9 +60,6 @@ def test_what_undoes_an_install_is_named_and_works(make_file, tmp_path: Path) ->
         assert call(main, *shlex.split(line)[1:]).returncode == 0
         with raises("calibration-withdrawn", InstallError):
             load_installed(root, camera=camera)
-        with raises("nothing-older", InstallError) as refused:
-            rollback(root, camera=camera)
-        assert line not in refused.value.remedy, "it is withdrawn already"
     install(make_file(0.001), root)
     install(make_file(0.002), root)
     assert call(main, *shlex.split(undo_line(root))[1:]).returncode == 0

@@ -21,7 +21,7 @@ from calibrate.files.folders import cameras
 from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
 from calibrate.files.integrity import canonical_json
 from calibrate.files.touch import Touch, agrees, touch_sigmas
-from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState, validity_text
+from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
 from calibrate.files.versions import installed_versions, note_in_file, note_installed, read_log
 from tests.codes import raises
 from tests.patience import PATIENCE_S
@@ -38,9 +38,8 @@ def root(make_file: MakeFile, tmp_path: Path) -> Path:
     return tmp_path / "s"
 
 
-def check(root: Path, passed: bool, proves: bool = True, kind: CheckKind = "drift-check") -> Validity:
-    when = datetime.now(UTC) + timedelta(seconds=2)
-    return note_check(root, kind, MOVED, passed=passed, proves=proves, when=when)
+def check(root: Path, passed: bool, proves: bool = True, reason: ValidityReason = MOVED) -> Validity:
+    return note_check(root, reason, passed, proves, datetime.now(UTC) + timedelta(seconds=2))
 
 
 def touch(offset_mm: float) -> Touch:
@@ -64,7 +63,7 @@ def test_what_is_installed_is_valid_until_a_check_contradicts_it_and_again_when_
 def test_a_pass_that_could_have_missed_the_shift_proves_nothing(root: Path) -> None:
     check(root, passed=False)
     since = load_installed(root, require_valid=False).validity.since
-    assert check(root, passed=True, proves=False, kind="touch-test").state is U
+    assert check(root, passed=True, proves=False, reason=ValidityReason("touch-test")).state is U
     with raises("calibration-unverified", InstallError, since=since):
         load_installed(root, require_valid=True)
     assert load_installed(root).validity.state is U
@@ -73,8 +72,7 @@ def test_a_pass_that_could_have_missed_the_shift_proves_nothing(root: Path) -> N
 
 
 def test_old_views_tell_nothing_of_today(root: Path) -> None:
-    long_ago = datetime(2020, 1, 1, tzinfo=UTC)
-    note_check(root, "drift-check", MOVED, passed=False, proves=True, when=long_ago)
+    note_check(root, MOVED, False, True, datetime(2020, 1, 1, tzinfo=UTC))
     assert load_installed(root).validity.state is V
 
 

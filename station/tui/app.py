@@ -40,7 +40,7 @@ from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.stop_key import run_behind_stop_key
 from station.tui.task import DIGITS, STEPS
-from station.tui.widgets.preview import PreviewPane
+from station.tui.widgets.preview import PreviewPane, sharp_widget
 
 LOOK_S = 2.0
 PREVIEW_PERIOD_S = 0.25
@@ -121,7 +121,7 @@ class StationApp(LivePageApp[None], DaemonApp):
             await asyncio.sleep(PREVIEW_PERIOD_S)
             for preview in self.screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
-                    preview.show(await self.link.client.call(verbs.Preview(*preview.wanted_pixels())))
+                    await preview.fetch(self.link.client)
 
     @work(exclusive=True, group="live page", exit_on_error=False)
     async def action_open_live(self) -> None:
@@ -301,4 +301,10 @@ def _one_more(before: SessionStatus, now: SessionStatus) -> bool:
 
 def run(socket: Path) -> None:
     """Open the screen on the daemon that serves `socket` and return when it is closed."""
-    run_behind_stop_key(lambda: StationApp(Client(socket)).run(), socket)
+    client = Client(socket)
+
+    def show() -> None:
+        PreviewPane.sharp = sharp_widget()
+        StationApp(client).run()
+
+    run_behind_stop_key(show, socket)

@@ -105,10 +105,14 @@ class StationScreen(Framed[None]):
     def does_something(self, action: str) -> bool:
         return action != f"switch_mode('{self.MODE}')" and super().does_something(action)
 
+    def on_screen_suspend(self) -> None:
+        for preview in self.query(PreviewPane):
+            preview.soften()
+
     def show(self, known: Known) -> None:
         self.set_class(known.old, "-old")
         for preview in self.query(PreviewPane):
-            preview.old = known.blind
+            preview.old, preview.calm = known.blind, not known.works
         super().show(known)
 
     @property

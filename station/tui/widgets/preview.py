@@ -1,10 +1,16 @@
-"""The camera's image and its found corners, drawn by half blocks."""
+"""The camera's image and its found corners: half blocks on any terminal, sharp where it can draw them."""
 
 from __future__ import annotations
 
 import base64
+import importlib
+import os
+import sys
+import termios
+import time
 from functools import lru_cache
 from itertools import groupby
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -12,15 +18,22 @@ from numpy.typing import NDArray
 from rich.color import Color
 from rich.segment import Segment
 from rich.style import Style
+from textual.app import ComposeResult
 from textual.geometry import Size
 from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
 from station.protocol import verbs
+from station.protocol.client import Client
+from station.tui.themes import TERMINAL, chosen_theme
 
+SHARP_S = 1.0
+"""Between two sharp images at least: drawing one takes up to 0.1 s of the processor."""
 LEVELS = 20
 """Shades a terminal image is drawn with: fewer styles to send, and no eye sees more in half blocks."""
+GREYS = 16
+"""Shades of a sharp image: its bytes grow with them."""
 _CORNER, _WANTED = -1, -2
 """Cells that show a corner, or the outline of the wanted view, in place of shades."""
 _BLACK = Color.from_rgb(0, 0, 0)
@@ -37,15 +50,43 @@ _BAYER = (np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]
 """Thresholds of ordered dithering. True greys are not dithered: each cell would need a style of its own."""
 
 
+def sharp_widget() -> Any:
+    """Return textual-image's widget; None where it is missing, not wanted, or the terminal draws no images.
+
+    The library asks the terminal when it is imported: only before the screen reads its keys.
+    """
+    remote = "SSH_TTY" in os.environ or "SSH_CONNECTION" in os.environ
+    keys, glass = sys.__stdin__, sys.__stdout__
+    if remote or chosen_theme() == TERMINAL:  # over ssh STOP's key and every picture share one line
+        return None
+    if keys is None or glass is None or not keys.isatty() or not glass.isatty():
+        return None
+    try:
+        drawn = importlib.import_module("textual_image.renderable")
+        widget = importlib.import_module("textual_image.widget").Image
+    except ImportError:
+        return None
+    finally:
+        termios.tcflush(keys, termios.TCIFLUSH)  # an answer that came late would be read as keys
+    return widget if drawn.Image in (drawn.SixelImage, drawn.TGPImage) else None
+
+
 class PreviewPane(Widget):
     """The last image it was given; scales with its own size, keeps the aspect ratio."""
 
-    DEFAULT_CSS = "PreviewPane { width: 1fr; height: 1fr; }"
+    DEFAULT_CSS = """
+    PreviewPane { width: 1fr; height: 1fr; align: center top; }
+    PreviewPane > * { display: none; height: auto; }
+    """
 
+    sharp: ClassVar[Any] = None
+    """The widget for sharp images; None: half blocks only."""
     old: reactive[bool] = reactive(False)
     """The image is out of date; written across it."""
     wanted: reactive[Outline] = reactive(())
     """Corners of the board in the wanted view, in order, as shares of the image's sides; drawn as a line."""
+    calm: reactive[bool] = reactive(True)
+    """The arm rests. While it works nothing that takes long to draw may make STOP wait."""
 
     def __init__(self, *, id: str | None = None) -> None:
         super().__init__(id=id)
@@ -54,6 +95,17 @@ class PreviewPane(Widget):
         self._corners: NDArray[np.float64] = np.zeros((0, 2))
         self._rows: list[Strip] = []
         self._rows_size = Size(0, 0)
+        self._next_s = 0.0
+        """Time before which no sharp image is drawn."""
+
+    def compose(self) -> ComposeResult:
+        if self.sharp is not None:
+            yield self.sharp()
+
+    async def fetch(self, link: Client) -> None:
+        """Ask for an image and show it, where one may be drawn already."""
+        if not self._sharp() or time.monotonic() >= self._next_s:
+            self.show(await link.call(verbs.Preview(*self.wanted_pixels())))
 
     def show(self, answer: verbs.PreviewImage) -> None:
         """Show an image, if there is one and it does not stand there already."""
@@ -66,16 +118,71 @@ class PreviewPane(Widget):
         self._image, self._sequence = np.asarray(image, dtype=np.uint8), answer.sequence
         self._corners = np.array(answer.corners, dtype=float).reshape(-1, 2)
         self._rows_size = Size(0, 0)
+        self._sharpen()
         self.refresh()
+
+    def _sharp(self) -> bool:
+        """Tell whether a sharp image may stand here: it would hide what is drawn over it."""
+        if self.sharp is None or self.old or not self.calm or not self.screen.is_active:
+            return False
+        return not any(part.display for part in self.screen.query("Toast, Tooltip, Stopped"))
+
+    def _sharpen(self) -> None:
+        if self._image is None or not self._sharp():
+            self.soften()
+            return
+        from PIL import Image  # comes with textual-image
+
+        shades = self._image.astype(int) * GREYS // 256 * (255 // (GREYS - 1))
+        coloured = cv2.cvtColor(shades.astype(np.uint8), cv2.COLOR_GRAY2RGB)
+        height, width = self._image.shape
+        for place in np.rint(self._corners * (width, height)).astype(int).tolist():
+            cv2.drawMarker(coloured, place, (0, 0, 0), cv2.MARKER_CROSS, 9, 3)
+            cv2.drawMarker(coloured, place, (0, 230, 0), cv2.MARKER_CROSS, 7, 1)
+        self._outline(coloured, (0, 0, 0), 5)
+        self._outline(coloured, (255, 200, 0), 2)
+        across, down = self._cell()
+        scale = min(self.size.width * across / width, self.size.height * down / height)
+        child: Any = self.children[0]
+        child.image = Image.fromarray(coloured)
+        child.styles.width, child.display = max(1, int(width * scale) // across), True
+        self._next_s = time.monotonic() + SHARP_S
+
+    def _outline(self, image: cv2.typing.MatLike, colour: tuple[int, ...], thickness: int = 1) -> None:
+        """Draw the wanted view's outline into an image."""
+        if self.wanted:
+            places = np.rint(np.array(self.wanted) * image.shape[1::-1]).astype(np.int32)
+            cv2.polylines(image, [places], True, colour, thickness)
+
+    def soften(self) -> None:
+        """Show half blocks: a sharp image would hide what is drawn over it."""
+        for child in self.children:
+            child.display = False
+
+    def watch_old(self) -> None:
+        self.soften()
 
     def watch_wanted(self) -> None:
         self._rows_size = Size(0, 0)
 
+    def watch_calm(self) -> None:
+        self.soften()
+
+    def _cell(self) -> tuple[int, int]:
+        """Width and height of one character in pixels, or what stands for them in half blocks."""
+        if not self._sharp():
+            return 1, 2
+        cell: tuple[int, int] = importlib.import_module("textual_image._terminal").get_cell_size()
+        return cell
+
     def wanted_pixels(self) -> tuple[int, int]:
         """Return width and height of the largest image that this widget can show."""
-        return max(16, self.size.width), max(16, 2 * self.size.height)
+        across, down = self._cell()
+        return max(16, across * self.size.width), max(16, down * self.size.height)
 
     def render_line(self, y: int) -> Strip:
+        if any(child.display for child in self.children):
+            return Strip.blank(self.size.width, self.rich_style)
         if self._rows_size != self.size:
             self._rows, self._rows_size = self._draw(self.size), self.size
         if self.old and self._image is not None and y == self.size.height // 2:
@@ -99,9 +206,7 @@ class PreviewPane(Widget):
         dithered = small.reshape(shades.shape).mean(axis=1) / 255 * (len(FEW_SHADES) - 1) + dark
         cells = (shades[:, 0] * LEVELS + shades[:, 1] if few is None else dithered.astype(int)).tolist()
         lined = np.zeros((rows // 2, columns), np.uint8)
-        if self.wanted:
-            places = np.rint(np.array(self.wanted) * lined.shape[::-1]).astype(np.int32)
-            cv2.polylines(lined, [places], True, 1)
+        self._outline(lined, (1,))
         for row, column in np.argwhere(lined).tolist():
             cells[row][column] = _WANTED
         for x, y in self._corners:

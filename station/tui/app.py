@@ -273,11 +273,6 @@ class StationApp(LivePageApp[None], DaemonApp):
         if not held or await self.link.ask_person(Confirm("Close the screen?", HELD, yes="Close")):
             self.exit()
 
-    def get_key_display(self, binding: Binding) -> str:
-        """Write F5 as it is printed on the key."""
-        shown = super().get_key_display(binding)
-        return shown.upper() if shown[0] == "f" and shown[1:].isdigit() else shown
-
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """List every key's action by name; what moves the arm asks first from here too.
 

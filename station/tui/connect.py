@@ -19,7 +19,7 @@ STATES: dict[str, tuple[Mark, str]] = {
     "ok": ("done", "ready"),
     "warning": ("look", "look"),
     "failed": ("failed", "MISSING"),
-    "skipped": ("todo", "optional"),
+    "skipped": ("todo", "no need"),
 }
 
 

@@ -30,6 +30,8 @@ STOP_ELSEWHERE = "STOP on\nits own\npendant", "STOP is on the arm's\nown pendant
 """In place of STOP where a person moves the arm, which the station cannot stop."""
 WHY_CELLS = 16
 """Cells below which a reason would be cut to nothing that is understood."""
+MODEL_CELLS = 20
+"""Cells of an arm's name, which a person chose."""
 RAIL_WIDE = 96
 """From this width on each step has a second line."""
 ANSWER = Action("", "Answer the question", "Tab, Enter: yes. Enter, Escape: no.", look=True)
@@ -126,7 +128,8 @@ def _bar_parts(known: Known, title: str) -> Iterator[Content]:
 def _robot_parts(status: StationStatus) -> Iterator[Content]:
     robot = status.robot
     if robot.by_hand:
-        yield Content.styled(f"  {robot.model or 'no arm'}", "bold $strong") + dim(" moved by a person")
+        model = shortened(robot.model or "no arm", MODEL_CELLS)
+        yield Content.styled(f"  {model}", "bold $strong") + dim(" moved by a person")
         yield Content.styled(f"  {robot.notice}", "$warn")
         return
     safe = robot.condition.safety or "not known"
@@ -214,6 +217,7 @@ NEEDS: dict[str, Callable[[Known], object]] = {
     **dict.fromkeys(("report", "act('touch test')"), lambda now: now.result),
     **dict.fromkeys(("pose('retake')", "pose('skip')"), lambda now: now.shown.session.poses),
     **dict.fromkeys(("act('solve')", "act('check')"), lambda now: now.sessions),
+    "take_back": lambda now: now.shown.session.captured,
     "act('recover')": lambda now: not all(kept.session.sealed for kept in now.sessions or ()),
 }
 """What the action of a key works on; it has none while that is empty."""
@@ -259,6 +263,8 @@ class Framed(Screen[R]):
     def does_something(self, action: str) -> bool:
         """Tell whether the action of a key is possible now."""
         verb, status = ASKS.get(action), self.known.shown
+        if verb is not None and self.known.old:
+            return False
         if action == "freedrive" and self.known.by_hand:
             return True
         if verb is not None and (status.state not in verb.states or (verb.moves and status.robot.by_hand)):

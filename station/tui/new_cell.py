@@ -16,6 +16,7 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
+from textual.markup import escape
 from textual.reactive import reactive
 from textual.widgets import Footer, Input, OptionList, Static
 from textual.widgets.option_list import Option
@@ -95,6 +96,7 @@ class NewCell(LivePageApp[Ending]):
         yield Footer(compact=True, show_command_palette=False)
 
     def on_mount(self) -> None:
+        self.query_one("#text").border_title = escape(str(self.setup.output))
         self.watch_step()
         self.set_interval(ARM_PERIOD_S, self._show)  # what the arm tells
         self.look_at_camera()

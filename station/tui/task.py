@@ -16,7 +16,6 @@ from station.tui.words import UNKNOWN, Mark, duration, many, sentence
 
 STEPS = ("connect", "plan", "capture", "result")
 DIGITS = {mode: str(place) for place, mode in enumerate((*STEPS, "sessions", "log"), start=1)}
-SILENT = "What stands below is old. The arm's watchdog stops it."
 _STILL = {StationState.IDLE, StationState.PAUSED, StationState.FREE_DRIVE}
 
 
@@ -196,8 +195,10 @@ def next_action(known: Known) -> Action:
     """Choose the one next action; its reason names alternatives."""
     status = known.live
     if known.silent_s is not None:
-        why = f"No answer for {known.silent_s:.0f} s. {SILENT}"
-        return Action("", "EMERGENCY STOP if it moves", why, look=True)
+        why = f"No answer for {known.silent_s:.0f} s. What stands below is old."
+        if known.shown.robot.by_hand:
+            return Action("", "Wait", why, look=True)
+        return Action("", "EMERGENCY STOP if it moves", f"{why} The arm's watchdog stops it.", look=True)
     if status is None:
         return _without_daemon(known)
     latched = status.state in LATCHED or status.state is StationState.DISCONNECTED
@@ -219,7 +220,7 @@ def _without_daemon(known: Known) -> Action:
     session, safe = known.status.session, ""
     if session.name and session.captured and not session.recording:
         safe = f"Your {many(session.captured, 'pose')} {'is' if session.captured == 1 else 'are'} safe. "
-    why = f"{safe}The daemon ended: the controller stops the arm."
+    why = f"{safe}The daemon ended{'' if known.status.robot.by_hand else ': the controller stops the arm'}."
     return Action("Ctrl-Q", "Close, then run station", why, look=True)
 
 

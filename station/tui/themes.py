@@ -9,6 +9,7 @@ from typing import TypeVar
 from rich.segment import Segment
 from rich.style import Style
 from textual.app import App
+from textual.binding import Binding
 from textual.color import Color
 from textual.filter import LineFilter
 from textual.theme import BUILTIN_THEMES, Theme
@@ -127,6 +128,11 @@ class ThemedApp(App[R]):
             self.unregister_theme(name)
         if self.no_color:
             self._filters.append(NoColour())
+
+    def get_key_display(self, binding: Binding) -> str:
+        """Write F5 as it is printed on the key."""
+        shown = super().get_key_display(binding)
+        return shown.upper() if shown[0] == "f" and shown[1:].isdigit() else shown
 
     def action_help_quit(self) -> None:
         """Answer Ctrl-C, which stops the arm in a shell, but not here."""

@@ -31,7 +31,7 @@ from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
 from station.tui.frame import BREAKPOINTS, Frame, StopBlock, fitting, next_line, rail_line
 from station.tui.live_page import LivePageApp, news
 from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
-from station.tui.task import Step
+from station.tui.task import Action, Step
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import dim
 
@@ -75,8 +75,12 @@ class NewCell(LivePageApp[Ending]):
         self._pictures = 0
         self._news = dict[str, object]()
         """What the live page shows."""
-        self._lost, self._searched_s = False, 0.0
-        """The camera, or the search for one, failed at the last look; when cameras were searched last."""
+        self._asking = ""
+        """What the arm or a camera is asked, in words; empty: nothing."""
+        self._problem = self._camera_problem = ""
+        """Why the last answer was not taken, and why there was no image at the last look."""
+        self._searched_s = 0.0
+        """When cameras were searched last."""
 
     def compose(self) -> ComposeResult:
         yield Frame(*(Static(id=line) for line in ("bar", "rail", "next")))
@@ -106,9 +110,8 @@ class NewCell(LivePageApp[Ending]):
     async def resume(self) -> None:
         """Connect to the devices of the draft, then show the first step that is not done."""
         draft = self.setup.draft
-        with self._problems():
+        with self._problems(f"Asking {draft.host} …" if draft.host else ""):
             if draft.host:
-                self._say("#live-lines", f"Asking {draft.host} …")
                 await self.setup.connect(draft.host)
             if draft.camera is not None:
                 await self.setup.open(draft.camera)
@@ -126,12 +129,9 @@ class NewCell(LivePageApp[Ending]):
                     self._searched_s = time.monotonic()
                 if self.setup.camera is not None:
                     await self._look()
-                if self._lost:
-                    self._lost = False
-                    self._tell_found()
+                self._camera_problem = ""
             except StationError as problem:
-                self._lost = True
-                self._say("#problem", str(problem))
+                self._camera_problem = str(problem)
                 if self.live_page is not None:
                     self.live_page.publish(self._news | {"old": True})
                 await asyncio.sleep(LOOK_S)
@@ -168,19 +168,13 @@ class NewCell(LivePageApp[Ending]):
                 self.live_page.publish(self._news)
         if taken:
             self._view_taken()
-        self._show()
 
     def _view_taken(self) -> None:
         self.bell()
         if self.setup.correct_mount():
             self.notify("The views fit the other drawing: step 3 is corrected.")
-        self._tell_found()
         if self.setup.draft.enough:
             self.step = flow.next_step(self.setup.draft)
-
-    def _tell_found(self) -> None:
-        found = self.setup.draft.found
-        self._say("#problem", "" if found is None else found.warning)
 
     # --- keys ---
 
@@ -218,9 +212,6 @@ class NewCell(LivePageApp[Ending]):
         self.setup.change_mount()
         self.watch_step()
 
-    def on_input_changed(self) -> None:
-        self._show()
-
     def on_input_submitted(self) -> None:
         self.action_accept()
 
@@ -230,9 +221,7 @@ class NewCell(LivePageApp[Ending]):
     @work(group="accept", exclusive=True, exit_on_error=False)
     async def action_accept(self, chosen: CameraChoice | None = None, ending: Ending = "serve") -> None:
         step = self.step
-        if step is CellStep.ROBOT:
-            self._say("#live-lines", "Asking the controller …")
-        with self._problems():
+        with self._problems("Asking the controller …" if step is CellStep.ROBOT else ""):
             text = self.query_one("#typed", Input).value.strip()
             look_first = chosen is not None and await self.setup.open(chosen)
             if look_first or not await accept(self.setup, step, text):
@@ -251,7 +240,6 @@ class NewCell(LivePageApp[Ending]):
 
     def action_drop(self) -> None:
         self.setup.change(views=self.setup.draft.views[:-1])
-        self._tell_found()
 
     def action_table_here(self) -> None:
         with self._problems():
@@ -261,13 +249,10 @@ class NewCell(LivePageApp[Ending]):
 
     # --- what is shown ---
 
-    def on_resize(self) -> None:
-        self.call_after_refresh(self._show)
-
     def watch_step(self) -> None:
         setup, page = self.setup, PAGES[self.step]
+        self._problem = ""
         self._say("#title", page.title)
-        self._say("#about", about(setup, self.step))
         for part in ("#typed", "#choice", "#drawings", "#picture", "#text"):
             self.query_one(part).display = part in page.parts
         for mount in DRAWINGS:
@@ -282,8 +267,6 @@ class NewCell(LivePageApp[Ending]):
             self.set_focus(None)
         if self.step is CellStep.SAVE:
             self.query_one("#written", Static).update(Text(file_text(setup)))
-        self._tell_found()
-        self._show()
         self.refresh_bindings()
 
     def _show(self) -> None:
@@ -302,11 +285,15 @@ class NewCell(LivePageApp[Ending]):
         bar.append(dim("  Your hand moves the arm, never this wizard."))
         self._say("#bar", fitting(bar, width))
         self._say("#rail", rail_line(self._rail(), self.step, width))
-        self._say(
-            "#next",
-            next_line(next_of(setup, self.step, self.query_one("#typed", Input).value.strip()), width),
-        )
+        action = next_of(setup, self.step, self.query_one("#typed", Input).value.strip())
+        if self._asking:
+            action = Action("", "Wait", self._asking)
+        self._say("#next", next_line(action, width))
+        self._say("#about", about(setup, self.step))
         self._say("#live-lines", live_lines(setup, self.step))
+        warning = "" if setup.draft.found is None else setup.draft.found.warning
+        self._say("#problem", problem := self._camera_problem or self._problem or warning)
+        self.query_one("#problem").display = bool(problem)
 
     def _rail(self) -> tuple[Step, ...]:
         draft = self.setup.draft
@@ -321,19 +308,18 @@ class NewCell(LivePageApp[Ending]):
         )
 
     def _say(self, selector: str, text: str | Content) -> None:
-        part = self.query_one(selector, Static)
-        part.update(text)
-        if selector == "#problem":
-            part.display = bool(text)
+        self.query_one(selector, Static).update(text)
 
     @contextmanager
-    def _problems(self) -> Iterator[None]:
-        """Show an error on the page instead of raising it."""
+    def _problems(self, asking: str = "") -> Iterator[None]:
+        """Show what is awaited meanwhile, and an error on the page instead of raising it."""
+        self._asking, self._problem = asking, ""
         try:
             yield
         except (CodedError, OSError) as problem:
-            self._say("#problem", str(problem))
-            self._show()  # in place of what was awaited
+            self._problem = str(problem)
+        finally:
+            self._asking = ""
 
     async def on_unmount(self) -> None:
         await self.setup.close()

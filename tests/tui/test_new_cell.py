@@ -15,10 +15,10 @@ from textual.widgets import Input, OptionList, Static
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec, Image, Stamps
 from station.cell.config_file import load_config
-from station.cell.errors import CameraError
+from station.cell.errors import CameraError, RobotError
 from station.cell.layout import guess_matrix
 from station.cli.new import RealHardware
-from station.operate.draft import CameraChoice, CameraReader, CellStep
+from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep
 from station.simulation.cells import make_cell
 from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
@@ -198,6 +198,25 @@ async def test_a_camera_plugged_in_later_is_found_and_shown_before_it_is_taken(t
         await until(pilot, lambda: "SIM00001" in str(problem.render()))
         hardware.lost = False
         await until(pilot, lambda: not problem.display)
+
+
+async def test_the_wizard_says_what_it_waits_for_and_then_why_it_did_not_come(tmp_path: Path) -> None:
+    hardware, answered = GreyCamera(), asyncio.Event()
+
+    async def arm(host: str) -> ArmReader:
+        await answered.wait()
+        raise RobotError("model-not-told", host=host, known="UR10")
+
+    hardware.arm = arm
+    app = NewCell(hardware, tmp_path, tmp_path / "station.yaml")
+    async with app.run_test(size=(80, 24)) as pilot:
+        await pilot.press(*"1.1.1.1", "enter")
+        await until(pilot, lambda: "Wait" in str(app.query_one("#next", Static).render()))
+        problem = app.query_one("#problem", Static)
+        assert not problem.display
+        answered.set()
+        await until(pilot, lambda: "1.1.1.1" in str(problem.render()) and problem.display)
+        await until(pilot, lambda: "Wait" not in str(app.query_one("#next", Static).render()))
 
 
 async def test_stop_takes_a_new_connection_where_the_old_one_is_refused_or_dead() -> None:

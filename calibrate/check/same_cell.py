@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import msgspec
-
 from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
-from recordings.schema.messages import Mount, SessionInfo, Source
+from recordings.schema.messages import Mount, Source
 
 
 class OtherCellError(UsageError):
@@ -21,32 +19,22 @@ class OtherCellError(UsageError):
         return differs if differs in ("robot", "camera") else ""
 
 
-class CellIdentity(msgspec.Struct, frozen=True):
-    """Mounting, source, robot and camera of a recording, as compared with those of a calibration."""
+def require_same_cell(
+    where: str, calibration: Calibration, mount: Mount, source: Source, robot_serial: str, camera_serial: str
+) -> None:
+    """Raise OtherCellError for views of another mounting, robot or camera, or simulated and real ones.
 
-    mount: Mount
-    source: Source
-    robot_serial: str
-    camera_serial: str
-
-    @classmethod
-    def of(cls, info: SessionInfo) -> CellIdentity:
-        """Read the facts of a recording."""
-        return cls(info.mount, info.source, info.robot.serial, info.camera_identity.serial)
-
-
-def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) -> None:
-    """Raise OtherCellError for views of another mounting, robot or camera, or simulated and real ones."""
-    simulated = calibration.source == "simulated"
-    for name, new, known, same in (
-        ("mounting", seen.mount, calibration.mount, seen.mount == calibration.mount),
-        ("source", seen.source, calibration.source, (seen.source == "simulated") == simulated),
-        ("robot", *_serials(seen.robot_serial, calibration.robot.serial)),
-        ("camera", *_serials(seen.camera_serial, calibration.camera.serial)),
+    An empty serial number is not known, and differs from none.
+    """
+    for name, found, calibrated in (
+        ("mounting", mount, calibration.mount),
+        ("source", source, calibration.source),
+        ("robot", robot_serial, calibration.robot.serial),
+        ("camera", camera_serial, calibration.camera.serial),
     ):
+        if name == "source":  # whether real, imported or played back is no matter
+            same = (found == "simulated") == (calibrated == "simulated")
+        else:
+            same = found == calibrated or "" in (found, calibrated)
         if not same:
-            raise OtherCellError(where=where, differs=name, found=str(new), calibrated=str(known))
-
-
-def _serials(new: str, known: str) -> tuple[str, str, bool]:
-    return new, known, not new or not known or new == known
+            raise OtherCellError(where=where, differs=name, found=found, calibrated=calibrated)

@@ -15,7 +15,7 @@ import typer
 from calibrate.batch.cluster import cluster_workers
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import pool
-from calibrate.cli.files import read_limits
+from calibrate.cli.inputs import read_limits
 from calibrate.cli.output import AsJson, err, out
 from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit
 from calibrate.errors import UsageError

@@ -11,7 +11,7 @@ import typer
 
 from calibrate.boards.model import ambiguity_text, describe_board, typed_board
 from calibrate.boards.printing import PAPER_MM, board_sheet, board_texture
-from calibrate.cli.files import read_board
+from calibrate.cli.inputs import read_board
 from calibrate.cli.output import check_target, err, out
 from calibrate.errors import UsageError
 from calibrate.files.calibration import write_output

@@ -16,10 +16,10 @@ import typer
 from calibrate.check.drift import FEWEST_FOR_DRIFT_CHECK, POWER, DriftCheck, check_drift, known_cell
 from calibrate.check.history import Trend, append_check, read_checks
 from calibrate.check.production import MOST_PICTURES, check_production
-from calibrate.check.same_cell import CellIdentity, OtherCellError, require_same_cell
+from calibrate.check.same_cell import OtherCellError, require_same_cell
 from calibrate.check.trend import entry_of, find_trend
 from calibrate.cli.contracts import DriftCheckJson
-from calibrate.cli.files import read_board
+from calibrate.cli.inputs import read_board
 from calibrate.cli.installed import Root, named_or_installed
 from calibrate.cli.output import AsJson, detection_progress, err, out, print_json
 from calibrate.cli.solve_options import BoardFile
@@ -29,7 +29,7 @@ from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
 from calibrate.files.validity import Validity, ValidityReason, validity_text
 from calibrate.files.versions import installed_versions, same_solve
-from calibrate.job import JobOptions, PreparedViews, prepare_views
+from calibrate.job import JobOptions, prepare_views
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.importers.dataset import DATASET_FILE
 from recordings.importers.folder import import_folder
@@ -91,7 +91,10 @@ def drift_check(
     note = None if held is None else partial(note_check, root, camera=camera, version=held.version)
     own, trend, validity, before, unnoted = False, None, None, list[bool](), None
     if production:
-        result = _check_pictures(source, prepared, calibration)
+        if (mount := info.mount) != calibration.mount:
+            told = {"where": str(source), "found": mount, "calibrated": calibration.mount}
+            raise OtherCellError(differs="mounting", **told)
+        result = check_production(prepared.views, known_cell(calibration, prepared.loaded.board))
         text = production_text(result, len(prepared.views))
     else:
         _require_this_cell(source, info, calibration, root, note)
@@ -131,13 +134,6 @@ def drift_check(
         raise typer.Exit(DRIFTED)
     if proves_nothing or unnoted is not None:
         raise typer.Exit(CalibrationError.exit_code)
-
-
-def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibration) -> DriftCheck:
-    mount = prepared.recording.info.mount
-    if mount != calibration.mount:
-        raise OtherCellError(where=str(folder), differs="mounting", found=mount, calibrated=calibration.mount)
-    return check_production(prepared.views, known_cell(calibration, prepared.loaded.board))
 
 
 def _log(
@@ -195,7 +191,8 @@ def _require_this_cell(
 ) -> None:
     """Refuse views of another cell; a session of this cell with another device doubts what is installed."""
     try:
-        require_same_cell(str(recording), calibration, CellIdentity.of(info))
+        serials = info.robot.serial, info.camera_identity.serial
+        require_same_cell(str(recording), calibration, info.mount, info.source, *serials)
     except OtherCellError as other:
         own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
         if note is not None and own and other.device:

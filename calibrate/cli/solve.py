@@ -14,7 +14,7 @@ import typer
 from rich.table import Table
 
 from calibrate.cli.contracts import CompareJson, SolveJson
-from calibrate.cli.files import read_board, read_camera, read_limits
+from calibrate.cli.inputs import read_board, read_camera, read_limits
 from calibrate.cli.output import (
     AsJson,
     OpenReport,

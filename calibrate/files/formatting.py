@@ -178,10 +178,10 @@ def _gate_table(calibration: Calibration) -> Table:
     return table
 
 
-_SAID = 3.0
-"""Sigmas from which a finding is mentioned."""
-_COSTLY = 0.2
-"""Share of X's variance from which an error source is named with its remedy."""
+_CLEAR_SIGMAS = 3.0
+"""An error of the board that is larger than so many of its sigmas is told."""
+_LARGE_SHARE = 0.2
+"""The largest source of the error of X is told with its remedy where it has more than this of the variance."""
 _REMEDIES = {
     "intrinsics": "calibrate the intrinsics from more images",
     "board": "measure the board and state its tolerance (square_tolerance, flatness_m)",
@@ -199,7 +199,7 @@ def cell_sentences(calibration: Calibration) -> list[str]:
     if quality.board is not None:
         sentences += _board(quality.board, calibration.board.square_m * 1e3)
     name, share = next(iter(error_shares(calibration).items()), ("", 0.0))
-    if share > _COSTLY and name in _REMEDIES:
+    if share > _LARGE_SHARE and name in _REMEDIES:
         remedy, arm = _REMEDIES[name], calibration.arm_table
         if name == "kinematics" and arm is not None and arm.offered:
             remedy = "use the corrected arm"
@@ -244,15 +244,17 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
 
 
 def _board(board: BoardShape, square_mm: float) -> Iterator[str]:
-    if abs(board.scale) > _SAID * board.sigma[0]:
+    if abs(board.scale) > _CLEAR_SIGMAS * board.sigma[0]:
         size = square_mm * (1 + board.scale)
         yield (
             f"The board's squares are {size:.3f} ± {square_mm * board.sigma[0]:.3f} mm, "
             f"{square_mm:g} mm are stated."
         )
-    if abs(board.anisotropy) > _SAID * board.sigma[1]:
+    if abs(board.anisotropy) > _CLEAR_SIGMAS * board.sigma[1]:
         wider = "wider than tall" if board.anisotropy > 0 else "taller than wide"
         yield f"The print is {abs(board.anisotropy):.2%} {wider}."
-    bends = [b for b, sigma in zip(board.bend_m, board.sigma[2:], strict=True) if abs(b) > _SAID * sigma]
+    bends = [
+        b for b, sigma in zip(board.bend_m, board.sigma[2:], strict=True) if abs(b) > _CLEAR_SIGMAS * sigma
+    ]
     if bends:
         yield f"The board is bent by {max(map(abs, bends)) * 1e3:.2f} mm."

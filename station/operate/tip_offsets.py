@@ -16,7 +16,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.check.board_now import BoardNow, found_points, locate_board, offset_covariance
-from calibrate.check.same_cell import CellIdentity, require_same_cell
+from calibrate.check.same_cell import require_same_cell
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.folders import VERSION_NAME
@@ -56,8 +56,8 @@ async def see_board(link: Client, file: Path) -> SeenBoard:
     """Take an image; find the board by the calibration in `file`. Raises StationError, CalibrationError."""
     calibration = read_calibration(file)
     seen = await link.call(Observe(calibration.board), timeout_s=LOOK_S)
-    identity = CellIdentity(seen.mount, seen.source, seen.robot_serial, seen.camera_serial)
-    require_same_cell("The station", calibration, identity)
+    serials = seen.robot_serial, seen.camera_serial
+    require_same_cell("The station", calibration, seen.mount, seen.source, *serials)
     if not seen.corners:
         advice = "Jog the arm or lay the board so that the camera sees it whole."
         raise RefusedError("no-board", reason="No board in the image.", advice=advice)

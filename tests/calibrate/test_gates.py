@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.cli.files import read_limits
+from calibrate.cli.inputs import read_limits
 from calibrate.errors import UsageError
 from calibrate.files.formatting import figures
 from calibrate.gates import GateLimits, judge

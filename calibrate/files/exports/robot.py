@@ -102,8 +102,8 @@ class Urdf:
         joints = {_child(joint, "child").attrib["link"]: joint for joint in root.findall("joint")}
         return cls(given, root, dict(zip(root.iter(), starts, strict=True)), ends[-1], joints)
 
-    def way(self, link: str) -> list[Element]:
-        """List the joints from the root to a link."""
+    def joints_to(self, link: str) -> list[Element]:
+        """List the joints between the root and a link; no longer than all, where links carry each other."""
         found: list[Element] = []
         while link in self.joints and len(found) < len(self.joints):
             found.insert(0, self.joints[link])
@@ -111,7 +111,7 @@ class Urdf:
         return found
 
     def with_origin(self, joint: Element, origin: Array) -> tuple[int, int, bytes]:
-        """Return from where to where in the file something else comes, and what."""
+        """Make the change that gives a joint another origin: begin and end of what goes, and the new text."""
         old = joint.find("origin")
         tag = _TAG.match(self.given, self.at[joint if old is None else old])
         assert tag is not None
@@ -210,7 +210,7 @@ def _paths(robot: Urdf, n: int, frames: FrameNames) -> Iterator[_Path]:
         else next((name for name in links if name not in robot.joints), "")
     )
     for tip in [frames.flange] if frames.flange in links else links:
-        back, path = robot.way(base), robot.way(tip)
+        back, path = robot.joints_to(base), robot.joints_to(tip)
         while back and path and back[0] is path[0]:
             back, path = back[1:], path[1:]
         moving = [joint for joint in path if joint.get("type") != "fixed"]
@@ -224,10 +224,13 @@ def _paths(robot: Urdf, n: int, frames: FrameNames) -> Iterator[_Path]:
 
 
 def _recognise(paths: list[_Path], arm: CorrectedArm) -> tuple[_Path, Array, Array]:
-    """Find path, B and T with which the controller's base_from_flange is B · base_from_tip · T.
+    """Find the path in the URDF that is this arm, by 40 poses of the flange as the controller computes it.
 
-    Tried in this order: the links as named; with a constant tool; with a turned base as well; then all three
-    again with other signs of the joints.
+    With the constants B and T of the answer, controller's base_from_flange = B · base_from_tip · T. They are
+    needed where the file's base or tip is elsewhere than the controller's base or flange. The simplest answer
+    is taken: first joints that turn as the controller's do, then all choices of joints that turn the other
+    way. For each: neither B nor T, then T alone (a tool on the flange), then both (a base mounted anyhow).
+    Raises ValueError where two arms fit alike, UsageError where none does.
     """
     nominal, eye = arm.nominal_chain, np.eye(4)
     n = len(nominal.axes)
@@ -240,19 +243,27 @@ def _recognise(paths: list[_Path], arm: CorrectedArm) -> tuple[_Path, Array, Arr
         tried = [replace(path, axes=np.array(signs)[:, None] * path.axes) for path in paths]
         pairs = [(path, path.chain.forward(q)) for path in tried]
         pairs.sort(key=lambda pair: float(np.linalg.norm((pair[1] - told)[0, :3, 3])))  # the least tool first
-        if np.isfinite(least_m):  # no base or tool mends another angle between two places
+        if np.isfinite(least_m):  # quicker: B and T leave the angle between two poses as it is
             pairs = [
                 pair for pair in pairs if np.sqrt(np.mean((_turned(pair[1]) - turned) ** 2)) <= _MAX_OFF_RAD
             ]
-        for way, (path, place) in product(range(3), pairs):
-            B, T = eye, eye if way == 0 else mean_pose(inverse(place) @ told)
-            if way == 2:
-                T = inverse(solve_global(all_pairs(told, inverse(place))).X)
-                B = mean_pose(told @ inverse(place @ T))
-            off = np.sqrt((difference(B @ place @ T, told) ** 2).reshape(-1, 2, 3).sum(axis=2).mean(axis=0))
-            if (off < (_MAX_OFF_M, _MAX_OFF_RAD)).all():
-                return path, B, T
-            least_m = min(least_m, float(off[0]))
+        for constants in ("none", "T", "B and T"):
+            fitting = []
+            for path, place in pairs:
+                B, T = eye, eye if constants == "none" else mean_pose(inverse(place) @ told)
+                if constants == "B and T":
+                    T = inverse(solve_global(all_pairs(told, inverse(place))).X)
+                    B = mean_pose(told @ inverse(place @ T))
+                off = difference(B @ place @ T, told) ** 2
+                off = np.sqrt(off.reshape(-1, 2, 3).sum(axis=2).mean(axis=0))
+                least_m = min(least_m, float(off[0]))
+                if (off < (_MAX_OFF_M, _MAX_OFF_RAD)).all():
+                    fitting.append((path, B, T))
+            for path, _, _ in fitting[1:]:
+                if path.joints[path.turning[0]] is not (first := fitting[0][0]).joints[first.turning[0]]:
+                    raise ValueError(f"two arms fit: name {first.tip} or {path.tip} with --flange")
+            if fitting:
+                return fitting[0]
     raise UsageError("urdf-other-arm", off_mm=1e3 * least_m)
 
 

@@ -163,7 +163,8 @@ COMMANDS: dict[str, Command] = _SHORT | {
     for name, function in list(globals().items())
     if inspect.isfunction(function) and function.__module__ == __name__
 }
-"""Name → function: what this takes besides the machine is what a client sends."""
+"""Name → function. Every function above is a command too; its parameters behind the machine are the keys
+that a client sends."""
 
 
 @cache

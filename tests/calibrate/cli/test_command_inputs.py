@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calibrate.cli.files import read_camera
+from calibrate.cli.inputs import read_camera
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration
 from recordings.errors import UnfinishedRecordingError
@@ -59,6 +59,8 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
         refused(run("solve", session_file, option, "-3", cwd=tmp_path), 2, "", option)
         refused(run("solve", session_file, option, "1e300", cwd=tmp_path), 2, "", option)
     refused(run("install", "c.yaml", "--max-age-days", "3000000", cwd=tmp_path), 2, "", "36500")
+    both = ("--camera", "camera.yaml", "--estimate-intrinsics")
+    refused(run("solve", session_file, *both, cwd=tmp_path), 2, "options")
     refused(run("solve", cwd=tmp_path), 2)
     refused(run("export", "c.yaml", "--to", "nix", cwd=tmp_path), 2, "", "urdf")
 
@@ -215,10 +217,3 @@ def test_a_file_of_another_kind_is_named_with_what_to_give(session_file: Path, t
     word = tmp_path / "word.yaml"
     word.write_text("board\n")
     refused(run("solve", session_file, "--board", word, cwd=tmp_path), 2, "input-file", "word.yaml")
-
-
-def test_options_that_contradict_each_other_are_refused(
-    session_file: Path, real_file: Path, tmp_path: Path
-) -> None:
-    done = run("solve", session_file, "--camera", real_file, "--estimate-intrinsics", cwd=tmp_path)
-    refused(done, 2, "options")

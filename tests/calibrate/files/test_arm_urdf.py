@@ -190,6 +190,24 @@ def test_a_table_is_written_into_a_urdf_too(calibration: Calibration) -> None:
         np.testing.assert_allclose(found, arm.base_from_flange(q).matrix, atol=1e-10)
 
 
+@pytest.mark.parametrize("signs", [1.0, -1.0])
+def test_of_two_arms_alike_one_must_be_named(solved_real: SolvedRecording, signs: float) -> None:
+    """Where one counts its joints as the controller does and the other does not, it is told by that."""
+    calibration = with_arm(solved_real.calibration, "seven joints")
+    one, both = urdf_of("seven joints", "hand"), urdf_of("seven joints", "hand", signs)
+    arm, other = (
+        text[text.index(b'<link name="link_0"') : text.index(b"<transmission")] for text in (one, both)
+    )
+    other = re.sub(rb'((?:name|link)=")(?!world)', rb"\1other_", other)
+    given = one.replace(arm, other + arm)
+    if signs > 0:
+        with raises("urdf", UsageError):
+            exports.export(calibration, "urdf", arm=given)
+    names = FrameNames(flange="hand") if signs > 0 else None
+    written = exports.export(calibration, "urdf", names, given)
+    assert other in written and arm not in written
+
+
 def test_another_arm_is_refused_with_the_distance(calibration: Calibration) -> None:
     calibration = with_arm(calibration, "seven joints")
     for other in ("seven, no offsets", "ur"):

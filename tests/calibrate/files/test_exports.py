@@ -189,33 +189,24 @@ def urdf_origin(joint: ElementTree.Element) -> Array:
     return pose(R, xyz)
 
 
-def test_urdf_chain_ends_in_the_optical_frame(calibration: Calibration) -> None:
-    tree = ElementTree.fromstring(export(calibration, "urdf"))
-    first, second = tree.findall("joint")
-    assert first.find("parent").attrib["link"] == parent_of(calibration)
-    assert (
-        first.find("child").attrib["link"] == second.find("parent").attrib["link"] == "camera_calibrated_link"
-    )
-    assert second.find("child").attrib["link"] == "camera_calibrated_optical_frame"
-    body, optical = urdf_origin(first), urdf_origin(second)
-    same(body @ optical, calibration)
+@pytest.mark.parametrize("off_rad", [1.2, 0.0, 1e-9, 1e-7])
+@pytest.mark.parametrize("roll_rad", [0.0, np.pi, -2.3])
+def test_urdf_chain_ends_in_the_optical_frame(
+    calibration: Calibration, off_rad: float, roll_rad: float
+) -> None:
+    """Also where a camera looks along the flange: its body is pitched by 90°, roll and yaw turn alike."""
+    R = rotation_exp([0.0, 0.0, roll_rad]) @ rotation_exp([0.6 * off_rad, -0.8 * off_rad, 0.0])
+    transform = Transform(calibration.result.parent_frame, "camera", pose(R, [0.0, 0.0, 0.1]))
+    turned = msgspec.structs.replace(calibration, result=FramePose.of(transform))
+    first, second = ElementTree.fromstring(export(turned, "urdf")).findall("joint")
+    ends = [joint.find(end).attrib["link"] for joint in (first, second) for end in ("parent", "child")]
+    body = "camera_calibrated_link"
+    assert ends == [parent_of(calibration), body, body, "camera_calibrated_optical_frame"]
+    optical = urdf_origin(second)
+    same(urdf_origin(first) @ optical, turned)
     # REP-103: what the optical frame has ahead (z), the body has along x; optical right (x) is body -y.
     assert optical[:3, :3] @ [0, 0, 1] == pytest.approx([1, 0, 0])
     assert optical[:3, :3] @ [1, 0, 0] == pytest.approx([0, -1, 0])
-
-
-@pytest.mark.parametrize("off_rad", [0.0, 1e-9, 1e-7])
-@pytest.mark.parametrize("roll_rad", [0.0, np.pi, -2.3])
-def test_urdf_of_a_camera_that_looks_straight_along_the_flange(
-    calibration: Calibration, off_rad: float, roll_rad: float
-) -> None:
-    """The usual mount: its body frame is pitched by 90°, where roll and yaw turn about the same axis."""
-    R = rotation_exp([0.0, 0.0, roll_rad]) @ rotation_exp([0.6 * off_rad, -0.8 * off_rad, 0.0])
-    transform = Transform(calibration.result.parent_frame, "camera", pose(R, [0.0, 0.0, 0.1]))
-    straight = msgspec.structs.replace(calibration, result=FramePose.of(transform))
-    tree = ElementTree.fromstring(export(straight, "urdf"))
-    body, optical = (urdf_origin(joint) for joint in tree.findall("joint"))
-    same(body @ optical, straight)
 
 
 @pytest.mark.parametrize(

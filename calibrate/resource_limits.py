@@ -21,7 +21,8 @@ from calibrate.errors import CalibrationError
 TIME_LIMIT_S = 900.0
 MEMORY_LIMIT_MIB = 4096
 _GRACE_S = 10.0
-"""Compiled code hears of the time limit only when it returns; after this much more the process ends."""
+"""Python raises the error of the time limit between two of its own instructions, so never inside a long call
+of compiled code. After this much more time the process is ended."""
 
 
 class SolveLimitError(CalibrationError):
@@ -39,10 +40,10 @@ class Limits:
 
 
 def bounded(limits: Limits | None = None) -> AbstractContextManager[None]:
-    """Raise SolveLimitError once the block has taken so long, or so much memory.
+    """Limit the time and memory of a `with` block; beyond them SolveLimitError is raised in it.
 
-    Memory is that of this whole process (its data, not the files it maps). Outside the main thread, where no
-    signal can be had and others share the memory, nothing is limited.
+    Memory is that of this whole process (its data, not the files it maps). Outside the main thread nothing is
+    limited: Python gives signals to the main thread only, and other threads use the same memory.
     """
     if threading.current_thread() is not threading.main_thread():
         return nullcontext()
@@ -50,7 +51,7 @@ def bounded(limits: Limits | None = None) -> AbstractContextManager[None]:
 
 
 class _Bounded(AbstractContextManager[None]):
-    """A class, not a generator: an alarm at any moment must find out whether the block has ended already."""
+    """No `@contextmanager`: `_late` must see whether the alarm came inside `__enter__` or `__exit__`."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
@@ -62,7 +63,7 @@ class _Bounded(AbstractContextManager[None]):
             self._last = threading.Timer(self._limits.time_s + _GRACE_S, self._too_late)
             self._last.daemon = True
             self._last.start()
-            # again, should something swallow the first
+            # again each second, should an `except` inside the block swallow the first
             signal.setitimer(signal.ITIMER_REAL, self._limits.time_s, 1.0)
         soft, hard = self._memory_before = resource.getrlimit(resource.RLIMIT_DATA)
         if self._limits.memory_mib > 0:
@@ -79,12 +80,12 @@ class _Bounded(AbstractContextManager[None]):
             self._last.cancel()
         resource.setrlimit(resource.RLIMIT_DATA, self._memory_before)
         if problem is not None and problem.__context__ is self._late_error:
-            raise self._late_error from None  # a handler failed at the alarm, as that of `Thread.start` may
+            raise self._late_error from None  # code that the alarm interrupted raised another error over it
         if problem is not None and _is_out_of_memory(problem):
             raise SolveLimitError("memory-limit", limit_mib=self._limits.memory_mib) from None
 
     def _late(self, signal_number: int, frame: FrameType | None) -> None:
-        """Raising in the middle of `__exit__` would leave the thread alive that ends the process."""
+        """Raise at the alarm, but not inside `__enter__` or `__exit__`, which must cancel the timer."""
         while frame is not None:
             if frame.f_code in (_Bounded.__enter__.__code__, _Bounded.__exit__.__code__):
                 return
@@ -97,7 +98,7 @@ class _Bounded(AbstractContextManager[None]):
 
 
 def _is_out_of_memory(problem: BaseException) -> bool:
-    """A thread's stack is memory, too."""
+    """Tell the three errors of memory that ran out: Python's, OpenCV's, and of a thread without a stack."""
     if isinstance(problem, cv2.error):
         return bool(problem.code == cv2.Error.StsNoMem)
     thread = isinstance(problem, RuntimeError) and "start new thread" in str(problem)

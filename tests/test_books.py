@@ -41,9 +41,6 @@ def prepare(folder: Path) -> None:
     run("station doctor --example > station.yaml")
     run("station plan --config station.yaml -o plan.yaml")
     (folder / "driver.yaml").write_text(as_echo(DRIVERS["realsense d435"][2]))
-    joints = [pose["joints_rad"] for pose in yaml.safe_load((folder / "plan.yaml").read_text())["poses"]]
-    rows = [",".join(map(str, pose)) for pose in joints]
-    (folder / "poses.csv").write_text("\n".join([",".join(f"j{i}_rad" for i in range(1, 7)), *rows]) + "\n")
 
 
 def run(line: str) -> None:

@@ -92,8 +92,7 @@ def drift_check(
     own, trend, validity, before, unnoted = False, None, None, list[bool](), None
     if production:
         if (mount := info.mount) != calibration.mount:
-            told = {"where": str(source), "found": mount, "calibrated": calibration.mount}
-            raise OtherCellError(differs="mounting", **told)
+            raise OtherCellError(where=source, differs="mounting", found=mount, calibrated=calibration.mount)
         result = check_production(prepared.views, known_cell(calibration, prepared.loaded.board))
         text = production_text(result, len(prepared.views))
     else:

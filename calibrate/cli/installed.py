@@ -31,7 +31,6 @@ Root = Annotated[
 ]
 _FORMATS_HELP = "; ".join(f"{name}: {kind.help}" for name, kind in FORMATS.items())
 FormatName = StrEnum("FormatName", {name.replace("-", "_"): name for name in FORMATS})  # type: ignore[misc]
-_TOLD_OF_OLD = (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN)
 CameraName = Annotated[str, typer.Option("--camera", help="Name of the camera, in a cell with several")]
 Named = Annotated[Path | None, typer.Argument(help="A calibration file; default: the installed one")]
 
@@ -227,7 +226,7 @@ def _lines(version: InstalledVersion) -> list[str]:
     if calibration is None:
         return [version.problem]
     made = f"{calibration.provenance.session}, solved {calibration.created}"
-    told = version.current or validity.state in _TOLD_OF_OLD
+    told = version.current or validity.state in (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN)
     held = [validity_text(validity)] if told else []
     override = "" if calibration.override is None else f"; {override_text(calibration.override)}"
     return [made, pose_text(calibration), verdict_text(calibration) + override, *held]

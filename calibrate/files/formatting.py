@@ -181,7 +181,7 @@ def _gate_table(calibration: Calibration) -> Table:
 _CLEAR_SIGMAS = 3.0
 """An error of the board that is larger than so many of its sigmas is told."""
 _LARGE_SHARE = 0.2
-"""The largest source of the error of X is told with its remedy where it has more than this of the variance."""
+"""The largest source of the error of X is told with its remedy beyond this share of the variance."""
 _REMEDIES = {
     "intrinsics": "calibrate the intrinsics from more images",
     "board": "measure the board and state its tolerance (square_tolerance, flatness_m)",

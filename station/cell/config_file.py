@@ -140,6 +140,8 @@ def _is_calibrated(robot: RobotConfig) -> bool:
 def _webcam_problems(camera: CameraConfig) -> Iterator[Problem]:
     if camera.trigger == "hardware":
         yield "camera.trigger", "a webcam has no trigger line", "Choose software."
+    if camera.gain_db:
+        yield "camera.gain_db", "a webcam's gain is not set", "Leave it out."
     if camera.device and not camera.device.isdecimal() and not camera.device.startswith("/dev/"):
         # A video file beside a real arm would give a wrong calibration.
         text = f"'{camera.device}' is no webcam of this computer"

@@ -77,6 +77,13 @@ def new_session_folder(root: Path, cell: str) -> Path:
     raise StationError("session-folder", folder=sessions, reason="it has too many of this second")
 
 
+def require_writable(root: Path) -> None:
+    """Write a file below `root` and remove it. Raises OSError."""
+    probe = root / ".write-test"
+    probe.write_bytes(b"x")
+    probe.unlink(missing_ok=True)
+
+
 def segment_path(folder: Path, segment: int) -> Path:
     return folder / ("session.mcap" if segment == 1 else f"session-{segment}.mcap")
 

@@ -58,7 +58,10 @@ STATION = LazyGroup(
         "skip": LazyCommand("station.cli.requests:skip_command", ("station skip 7",), rare=True),
         "drift-check": LazyCommand(
             "station.cli.session:drift_check_command",
-            ("station drift-check", "station drift-check --poses 12"),
+            (
+                "station drift-check",
+                "station drift-check --plan plan.yaml --headless --approve 0123456789ab",
+            ),
         ),
         "accept": LazyCommand(
             "station.cli.accept:accept_command",

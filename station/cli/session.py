@@ -224,7 +224,8 @@ def resume_command(
 
 
 def drift_check_command(
-    poses: Annotated[int, typer.Option(min=4, max=50, help="Poses to capture")] = CHECK_VIEWS,
+    poses: Annotated[int, typer.Option(min=4, max=50, help="Poses to plan and capture")] = CHECK_VIEWS,
+    plan: Annotated[Path | None, typer.Option(help="Pose plan to capture in place of a new one")] = None,
     headless: Headless = False,
     approve: Approve = "",
     socket: Socket = None,
@@ -232,7 +233,8 @@ def drift_check_command(
     """Check by a few new poses that the calibration holds.
 
     The board may lie elsewhere by now. Eight poses detect a shift of 0.5 mm or 0.1° on a usual cell, five on
-    a quiet one; where they do not, it says how many more would. Ctrl-C stops the arm.
+    a quiet one; where they do not, it says how many more would. Ctrl-C stops the arm. With nobody there it
+    needs `--plan FILE --headless --approve HASH`, as `station capture` does.
 
     Exit codes: 0 PASS, 4 FAIL, 1 no recording or nothing installed, 2 usage.
     """
@@ -243,7 +245,8 @@ def drift_check_command(
             if standing.robot.by_hand:  # a person who moves it needs the picture
                 identity = standing.robot.identity
                 raise RefusedError("moved-by-hand", robot=identity.model if identity else "The arm")
-            started = await start_drift_check(shell.client, standing, shell.approves, poses)
+            kept = None if plan is None else load_plan(plan)
+            started = await start_drift_check(shell.client, standing, shell.approves, poses, kept)
             return await shell.watch(started, standing), shell.client.camera
 
     outcome, camera = asyncio.run(captured())

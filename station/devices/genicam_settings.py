@@ -39,9 +39,8 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
     region: Region = config.region or (0, 0, *camera.get_sensor_size())
     camera.set_region(*region)
     camera.set_exposure_time(config.exposure_us)
-    gain = 0.0
+    gain = _wanted_gain(camera, config)
     if camera.is_gain_available():
-        gain = _wanted_gain(camera, config)
         camera.set_gain(gain)
     if camera.is_gv_device():
         if config.packet_size is None:
@@ -90,7 +89,14 @@ def _knows_db(camera: Any) -> bool:
 
 
 def _wanted_gain(camera: Any, config: CameraConfig) -> float:
-    """Return the configured gain in the camera's unit; without dB, 0 dB is the camera's smallest gain."""
+    """Return the configured gain in the camera's unit; without dB, 0 dB is the camera's smallest gain.
+
+    CameraError where another than 0 dB is configured and cannot be set.
+    """
+    if not camera.is_gain_available():
+        if config.gain_db:
+            raise CameraError("no-gain")
+        return 0.0
     if _knows_db(camera):
         return config.gain_db
     low, high = camera.get_gain_bounds()

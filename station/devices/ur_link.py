@@ -20,7 +20,8 @@ from station.cell.layout import arm_model
 from station.cell.status import ArmCondition
 from station.devices.history import state_at
 from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
-from station.devices.ur_condition import condition, safety_stop
+from station.devices.rtde import RobotMode
+from station.devices.ur_condition import condition, not_powered, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_probe import (
     Found,
@@ -37,6 +38,8 @@ log = logging.getLogger(__name__)
 
 SUPERVISE_S = 0.2
 RETRY_S = 0.5
+STARTING = (RobotMode.NO_CONTROLLER, RobotMode.BOOTING)
+"""Modes in which no tool is taken from an arm: it may state kinematics and TCP offset only later."""
 
 
 class UrLink:
@@ -94,6 +97,8 @@ class UrLink:
         await check_script_port(host)
         reader = self.reader = StateReader(host, self._deliver, self.on_link_lost)
         first = await reader.open()
+        if first.state.robot_mode in STARTING and (starting := not_powered(first.state)) is not None:
+            raise starting
         self._primary = PrimaryReader(host)
         installation = await self._primary.first()
         if installation.tcp_offset is None:

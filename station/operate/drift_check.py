@@ -8,6 +8,7 @@ import msgspec
 
 from calibrate.check.history import read_checks
 from calibrate.files.install import installed_calibration
+from station.cell.pose_plan import Plan
 from station.cell.status import CHECK_VIEWS, SessionStatus, StationState, StationStatus
 from station.operate.motion import PREPARE_S, Approve, prepared_motion
 from station.operate.next_step import NextStep, after_drift_check
@@ -18,9 +19,15 @@ SEED = 0
 
 
 async def start_drift_check(
-    link: Client, status: StationStatus, approve: Approve, poses: int = CHECK_VIEWS
+    link: Client,
+    status: StationStatus,
+    approve: Approve,
+    poses: int = CHECK_VIEWS,
+    plan: Plan | None = None,
 ) -> bool:
     """Plan a few poses, ask, start; an arm that a person moves is guided. False: not approved, nothing moved.
+
+    `plan`: of the poses to capture, so that its hash is known before; None: `poses` new ones.
 
     The loaded plan, or none, stands again where nothing was started; the question names one never run.
     Raises CalibrationError before anything is planned when nothing is installed below the daemon's root.
@@ -31,7 +38,10 @@ async def start_drift_check(
         return True
     before, lost = (await link.call(GetPlan())).plan, _never_run(status)
     warnings = (f"the loaded plan of {lost} poses, never run, is replaced",) if lost else ()
-    await link.call(MakePlan(poses, SEED, lens_known=True), timeout_s=PREPARE_S)
+    if plan is None:
+        await link.call(MakePlan(poses, SEED, lens_known=True), timeout_s=PREPARE_S)
+    else:
+        await link.call(LoadPlan(plan))
     made, started = (await link.call(GetPlan())).plan, False
     try:
         started = await prepared_motion(link, Prepare(Purpose.DRIFT_CHECK), approve, warnings=warnings)

@@ -12,6 +12,7 @@ from calibrate.files.validity import ValidityState, validity_text
 from recordings.plain_text import bytes_text
 from station.cell.errors import CameraError, RobotError, TriggerError
 from station.cell.process import GRANT_REAL_TIME, in_real_time
+from station.cell.session_folder import require_writable
 from station.cell.status import StationState
 from station.devices.base import Mover
 from station.devices.discovery import USB3_MBIT_S, FoundCamera, UsbCamera, discover, discover_usb
@@ -176,9 +177,7 @@ def _disk_check(context: SessionContext) -> Check:
     reserve = context.cell.config.capture.free_space_bytes
     try:
         free = shutil.disk_usage(context.root).free
-        probe = context.root / ".write-test"
-        probe.write_bytes(b"x")
-        probe.unlink()
+        require_writable(context.root)
     except OSError as error:
         return Check("disk", "failed", f"{context.root}: {error.strerror}", "give --root a writable folder")
     text = f"{bytes_text(free)} free at {context.root}"

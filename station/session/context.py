@@ -145,8 +145,8 @@ class SessionContext:
             self.root, self.cell, folder, state.parts, state.elapsed_s, state.check
         )
         reason = (
-            f"The daemon ended during session {folder.name}; its {self.queue.done} poses are on the disk. "
-            "Look at the arm, acknowledge, then resume or finish."
+            f"The daemon ended during session {folder.name}. Saved: {self.queue.done} of "
+            f"{len(self.queue.statuses)} poses. Look at the arm, acknowledge, then resume or finish."
         )
         self.store.enter(StationState.STOPPED, reason, "interrupted")
         self.show_poses()

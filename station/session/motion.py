@@ -25,6 +25,7 @@ from station.cell.errors import LimitError, RefusedError
 from station.cell.layout import approval_sha256, arm_model, cell_geometry, require_kept_clear
 from station.cell.limits import PlanCheck, check_plan
 from station.cell.pose_plan import Plan
+from station.cell.session_folder import require_writable
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext
@@ -80,6 +81,7 @@ async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
     if context.cell.source != "playback":  # there no arm moves
         require_kept_clear(context.cell.config)
     try:
+        await DISK.run(require_writable, context.root)
         await DISK.run(require_free_space, context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
         raise RefusedError("disk-full", reason=str(full)) from None

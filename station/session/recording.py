@@ -161,7 +161,7 @@ class SessionRecording:
             for name, content in self._cell.attachments.items():
                 recorder.attach(name, "application/json", content)
             recorder.camera_model(info.camera)
-        except RecordingError:
+        except BaseException:
             recorder.close()
             raise
         self.camera = info.camera

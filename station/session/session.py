@@ -33,7 +33,7 @@ from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext, StatusStore
 from station.session.device_connector import DeviceConnector
-from station.session.ending import close_or_seal, unmark_busy
+from station.session.ending import close_or_seal
 from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
 from station.session.motion import ApprovalManager, MotionApproval, previewed, session_motion
@@ -97,19 +97,26 @@ class Session:
 
     async def kept_going(self, loop: Callable[[], Awaitable[object]]) -> None:
         """Run a task of the daemon's life; a defect in it ends in fault, then it begins again."""
-        told = ""
+        told = set[str]()
+
+        def tell(error: Exception) -> None:
+            if repr(error) not in told:  # one that stays fills no log
+                told.add(repr(error))
+                log.exception("a task of the daemon failed")
+
         while True:
             try:
                 await loop()
                 return
             except Exception as error:
-                if told != (told := repr(error)):  # one that stays fills no log
-                    log.exception("a task of the daemon failed")
-                defect = StationError("internal", error=told)
+                tell(error)
+                defect = StationError("internal", error=repr(error))
+            try:
                 if self.store.state not in LATCHED:
-                    with contextlib.suppress(Exception):  # the heartbeat must go on, whatever else fails
-                        await self._halt(StationState.FAULT, defect.text, defect.code)
-                await asyncio.sleep(BEGIN_AGAIN_S)
+                    await self._halt(StationState.FAULT, defect.text, defect.code)
+            except Exception as error:  # the heartbeat must go on, whatever else fails
+                tell(error)
+            await asyncio.sleep(BEGIN_AGAIN_S)
 
     async def close(self) -> None:
         """Stop the arm, finish the recording, then close devices and worker."""
@@ -156,7 +163,10 @@ class Session:
             await self._halt(self.context.resting, reason, "control-lost")
 
     async def _halt(self, state: StationState, reason: str, cause: str) -> None:
-        """Void the approval, end the run and stop the arm; then let the run write its data, `STOP_WAIT_S`."""
+        """Void the approval, end the run and stop the arm; then let the run write its data, `STOP_WAIT_S`.
+
+        At its end the run plans poses again that it did not complete.
+        """
         context, run = self.context, self._run
         self._void()
         context.requests = RunRequests(halt=True)
@@ -167,7 +177,6 @@ class Session:
         self.store.event(cause, reason, "warning")
         if run is not None:
             await asyncio.wait({run}, timeout=STOP_WAIT_S)
-        unmark_busy(context)
 
     async def acknowledge(self, who: str) -> None:
         """Leave `stopped` or `fault` after a person looked at the cell."""

@@ -182,7 +182,8 @@ class SessionSupervisor:
         """Report what made states of a resting arm late."""
         store, now_s = self._context.store, time.monotonic()
         late = self._context.cell.arm.delay(max(self.lags_s, default=0.0), since_s - TOLD_S)
-        began_ns = time.time_ns() - round(1e9 * (now_s - since_s))
-        told = any(event.code in set(Delay) and event.wall_ns > began_ns for event in store.status.events)
+        now_ns, late_ns = time.time_ns(), round(1e9 * (now_s - since_s))
+        recent = (e.code for e in store.status.events if 0 <= now_ns - e.wall_ns < late_ns)
+        told = not set(Delay).isdisjoint(recent)
         if late is not None and now_s - since_s > TOLD_S - CURRENT_S and not told:
             store.problem(late)

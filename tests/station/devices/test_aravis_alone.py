@@ -148,9 +148,9 @@ class Settable:
     """In place of `Aravis.Camera`: notes what is set and tells of what stands."""
 
     def __init__(
-        self, exposure_us: float, gain_db: float, region: tuple[int, int, int, int], unit: str = "dB"
+        self, exposure_us: float, gain_db: float, region: tuple[int, int, int, int], unit: str | None = "dB"
     ) -> None:
-        self._stands = exposure_us, gain_db, region
+        self._stands, self._unit = (exposure_us, gain_db, region), unit
         self._node = SimpleNamespace(get_unit=lambda: unit)
         self.set: dict[str, tuple[Any, ...]] = {}
 
@@ -176,7 +176,7 @@ class Settable:
         return 1280, 1024
 
     def is_gain_available(self) -> bool:
-        return True
+        return self._unit is not None
 
     def is_gv_device(self) -> bool:
         return False
@@ -230,3 +230,5 @@ def test_a_gain_that_is_not_in_db_is_the_smallest() -> None:
         apply_settings(LIBRARY, camera, CameraConfig(gain_db=6.0))
     applied = apply_settings(LIBRARY, camera, CameraConfig())
     assert applied.gain == 36.0 and not applied.gain_in_db
+    with raises("no-gain"):
+        apply_settings(LIBRARY, Settable(1000.0, 0.0, REGION, unit=None), CameraConfig(gain_db=6.0))

@@ -82,6 +82,12 @@ async def test_it_is_loaded_again_where_nothing_was_started(
     assert link.asked[-1] == verbs.LoadPlan(LOADED)
 
 
+async def test_a_plan_whose_hash_was_approved_before_is_captured_as_it_is() -> None:
+    link, plan = FakeLink(), msgspec.structs.replace(LOADED, note="for the night")
+    assert await start_drift_check(link, loaded(), AsyncMock(return_value=True), plan=plan)
+    assert verbs.LoadPlan(plan) in link.asked and verbs.MakePlan not in map(type, link.asked)
+
+
 def during(name: str, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
     check = name == "check"
     return StationStatus(state=state, session=SessionStatus(name=name, check=check, recording=recording))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
 
 from recordings.errors import MissingSegmentError, RecordingError
 from recordings.reader import open_recording
+from recordings.recorder import Recorder
 from recordings.schema.messages import Image
 from station.cell.errors import CameraError, SafetyStopError, TriggerError
 from station.cell.status import StationState as S
@@ -79,10 +81,28 @@ async def test_a_disk_that_fails_is_a_fault_and_never_a_pose_and_so_is_a_defect(
     assert ("move" in rig.arm.log) == (method == "sync")
 
 
-async def test_a_full_disk_is_told_before_anybody_is_asked(rig: Rig) -> None:
-    rig.configure(capture={"free_space_bytes": 10**18})
+@pytest.mark.parametrize("fault", ["full", "takes no file"])
+async def test_a_disk_on_which_nothing_can_be_recorded_is_told_before_anybody_is_asked(
+    rig: Rig, fault: str
+) -> None:
+    if fault == "full":
+        rig.configure(capture={"free_space_bytes": 10**18})
+    else:
+        (rig.session.context.root / ".write-test").mkdir()
     with raises("disk-full"):
         await rig.session.prepare(1, Purpose.RUN)
+
+
+@pytest.mark.parametrize("error", [RecordingError(), OSError("gone")])
+async def test_a_file_that_cannot_be_begun_is_closed_again(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    closed, close = list[Recorder](), Recorder.close
+    monkeypatch.setattr(Recorder, "close", lambda recorder: closed.append(recorder) or close(recorder))
+    monkeypatch.setattr("station.session.recording.enter_part", Mock(side_effect=error))
+    await rig.go_until(S.IDLE, S.FAULT)
+    await until(lambda: rig.arm.log[-1:] == ["end control"])
+    assert len(closed) == 1 and rig.session.context.recording is None and "move" not in rig.arm.log
 
 
 async def test_an_arm_that_was_moved_while_paused_is_not_driven(rig: Rig) -> None:

@@ -78,3 +78,15 @@ async def test_a_defect_in_the_heartbeats_loop_stops_the_arm_in_fault_and_the_lo
     rig.arm.beats, rig.arm.slow = 0, False
     await rig.go_until(S.IDLE, purpose=Purpose.RESUME)
     assert rig.arm.beats and len(sealed(rig).views()) == POSES
+
+
+async def test_a_defect_in_the_stop_that_follows_a_defect_is_logged_too(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(rig.session.supervisor, "first", Mock(side_effect=ZeroDivisionError))
+        patch.setattr(rig.arm, "stop", Mock(side_effect=IndexError))
+        await rig.until(S.FAULT)
+        await until(lambda: rig.session.supervisor.first.call_count > 1)
+    logged = [record.exc_info[0] for record in caplog.records if record.exc_info]
+    assert logged == [ZeroDivisionError, IndexError]

@@ -86,8 +86,6 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Newest state; None: not connected."""
     condition: ArmCondition = ArmCondition()
     remote: bool | None = None
-    control: bool = False
-    """True while the control process runs."""
     control_path: str = ""
     """Driver of the arm: ur_rtde, or script (the station's own)"""
     not_accepted: str = ""
@@ -234,7 +232,6 @@ class GuidanceStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     name: str = ""
     folder: str = ""
-    plan_sha256: str = ""
     poses: tuple[PoseStatus, ...] = ()
     working_distance_m: float | None = None
     """Distance of the point whose predicted error the plan states."""
@@ -299,7 +296,6 @@ class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
     first_move: str
     """First move, as '84 mm and 22° to pose 1'"""
     warnings: tuple[str, ...] = ()
-    start_joints_rad: Vector6 | None = None
     stop_test: StopTestMove | None = None
     """Move of the acceptance test; None: a motion that captures images."""
 
@@ -325,8 +321,6 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     estimate: EstimateStatus = EstimateStatus()
     guidance: GuidanceStatus = GuidanceStatus()
     lease: LeaseStatus = LeaseStatus()
-    go: MotionPreview | None = None
-    """Motion that waits for a person's approval."""
     events: tuple[Event, ...] = ()
     """Newest events, at most 100."""
 

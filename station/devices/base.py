@@ -124,10 +124,6 @@ class Arm(Protocol):
 class Mover(Protocol):
     """The driver that moves an arm. `start_control` replaces the program that runs on the robot."""
 
-    @property
-    def control(self) -> bool:
-        """True while the control program runs on the robot and takes moves from this station."""
-
     control_path: str
     """Driver of the arm: ur_rtde or script; empty where no real arm moves."""
     control_trouble: tuple[str, str]

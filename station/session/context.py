@@ -174,7 +174,6 @@ class SessionContext:
             return
         named = {"name": recording.name, "folder": str(recording.folder)} if recording else {}
         self.store.update_session(
-            plan_sha256=queue.sha256,
             poses=queue.statuses,
             working_distance_m=queue.plan.working_distance_m,
             current=current,

@@ -73,8 +73,8 @@ def session_motion(context: SessionContext, purpose: Purpose) -> Motion:
     return Motion(purpose, queue, queue.open)
 
 
-async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
-    """Check the whole path in the worker and make the preview.
+async def offered(context: SessionContext, motion: Motion, client_id: int) -> MotionApproval:
+    """Check the whole path in the worker and make what a client may approve, with its preview.
 
     LimitError: not free; ConfigError: nobody knows where camera or board are; RobotError.
     """
@@ -93,7 +93,7 @@ async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
     if check.problems:
         raise await _refused(context, plan, check, start)
     overhead_s = 0.0 if motion.stop_test else POSE_OVERHEAD_S * len(poses)
-    return MotionPreview(
+    preview = MotionPreview(
         token=secrets.token_urlsafe(16),
         purpose=_purpose_words(context, motion),
         approval_sha256=approval_sha256(queue.plan, context.cell.config),
@@ -104,9 +104,9 @@ async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
         duration_s=round(check.duration_s + overhead_s, 1),
         first_move=f"{_displacement(context, start, plan.poses[0].joints_rad)} to pose {poses[0] + 1}",
         warnings=tuple(await _warnings(context, state)),
-        start_joints_rad=start,
         stop_test=motion.stop_test,
     )
+    return MotionApproval(motion, preview, client_id, start)
 
 
 def _displacement(context: SessionContext, before: Sequence[float], after: Sequence[float]) -> str:
@@ -181,14 +181,10 @@ class MotionApproval:
     motion: Motion
     preview: MotionPreview
     client_id: int
+    start_joints_rad: Vector6
     expires_s: float = 0.0
     approval: str = ""
     """Who approved it, and how."""
-
-    @property
-    def start_joints_rad(self) -> Vector6:
-        assert self.preview.start_joints_rad is not None
-        return self.preview.start_joints_rad
 
     @property
     def said(self) -> str:
@@ -210,6 +206,7 @@ class ApprovalManager:
         self.waiting = replace(asked, expires_s=self._clock() + APPROVAL_LIFETIME_S)
 
     def void(self) -> None:
+        """Withdraw the offered motion, if any."""
         self.voids += 1
         self.waiting = None
 

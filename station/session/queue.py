@@ -8,7 +8,7 @@ import msgspec
 
 from recordings.errors import CodedError
 from station.cell.errors import RefusedError
-from station.cell.pose_plan import Plan, PlannedPose, plan_sha256
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import PoseState, PoseStatus
 
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
@@ -33,11 +33,6 @@ class PoseQueue:
             for status in restored:
                 if status.state not in ENDED:
                     self.note(status.index, state="planned")
-
-    @property
-    def sha256(self) -> str:
-        """Hash of the plan, to which an approval is bound."""
-        return plan_sha256(self.plan)
 
     @property
     def statuses(self) -> tuple[PoseStatus, ...]:

@@ -22,7 +22,7 @@ from recordings.software import software_versions
 from station.cell.config import matrix4
 from station.cell.errors import CameraError
 from station.cell.layout import guess_matrix
-from station.cell.pose_plan import Plan
+from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.session_folder import (
     SessionState,
     clear_active,
@@ -124,12 +124,10 @@ class SessionRecording:
             settings = await self._cell.camera.settings()
         except CameraError as error:
             settings = {"error": str(error)}  # taking images will report the same error
-        await to_the_end(DISK.run(self._open, queue.plan, queue.sha256, first_image, settings))
+        await to_the_end(DISK.run(self._open, queue.plan, first_image, settings))
         await self.save_state(queue)
 
-    def _open(
-        self, plan: Plan, plan_sha256: str, first_image: Image | None, settings: dict[str, object]
-    ) -> None:
+    def _open(self, plan: Plan, first_image: Image | None, settings: dict[str, object]) -> None:
         config = self._cell.config
         require_free_space(self.folder, config.capture.free_space_bytes)
         name = "" if config.camera.name == MAIN_CAMERA else config.camera.name
@@ -143,7 +141,7 @@ class SessionRecording:
             camera_identity=msgspec.structs.replace(self._cell.camera.identity, name=name),
             part=self.segment,
             created_wall_ns=time.time_ns(),
-            plan_sha256=plan_sha256,
+            plan_sha256=plan_sha256(plan),
             config_sha256=self._cell.config_sha256,
             software=software_versions(*_PACKAGES)
             | {"robot control": (mover.control_path if (mover := self._cell.mover) else "") or "none"}

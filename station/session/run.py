@@ -23,7 +23,7 @@ from station.protocol.verbs import Purpose
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
 from station.session.ending import failed, seal, unmark_busy
-from station.session.motion import Motion, MotionApproval, previewed, require_start
+from station.session.motion import Motion, MotionApproval, offered, require_start
 from station.session.stop_move import stop_half_way
 from station.session.threads import DISK, MOTION
 
@@ -99,14 +99,13 @@ class Run:
         if not left:
             return False
         try:
-            motion = Motion(Purpose.RESUME, queue, left)
-            preview = await previewed(context, motion)
+            go = await offered(context, Motion(Purpose.RESUME, queue, left), self._go.client_id)
         except StationError as trouble:
             store.problem(trouble)
             return False
         self._approved_again += 1
         said = f"approved by this simulated cell itself, {self._approved_again} of at most {APPROVED_AGAIN}"
-        self._go = replace(self._go, motion=motion, preview=preview, approval=said)
+        self._go = replace(go, approval=said)
         store.update_session(approved_again=count)
         store.event("approved-again", self._go.said, "warning", None, count=count)
         return True

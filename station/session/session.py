@@ -13,8 +13,6 @@ from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
-
 from recordings.errors import RecordingError
 from station.analysis.pool import Workers
 from station.analysis.worker import start_worker, warm_up
@@ -36,7 +34,7 @@ from station.session.device_connector import DeviceConnector
 from station.session.ending import close_or_seal
 from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
-from station.session.motion import ApprovalManager, MotionApproval, previewed, session_motion
+from station.session.motion import ApprovalManager, offered, session_motion
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue
 from station.session.run import Run
@@ -69,7 +67,7 @@ class Session:
         self.context = SessionContext(cell, self.store, Workers(start_worker, warm_up), monitor, root)
         # This clock goes on while the computer sleeps: no offer outlives that.
         self.approvals = ApprovalManager(lambda: time.clock_gettime(time.CLOCK_BOOTTIME))
-        self.supervisor = SessionSupervisor(self.context, self._void)
+        self.supervisor = SessionSupervisor(self.context, self.approvals.void)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context, self.previews)
@@ -156,7 +154,7 @@ class Session:
         lease = self.store.status.lease
         if lease.client_id != client_id:
             return
-        self._void()
+        self.approvals.void()
         self.store.update(lease=LeaseStatus())
         if self.store.state in RUNNING:
             reason = how.format(lease.holder) + " Approve again to continue."
@@ -168,7 +166,7 @@ class Session:
         At its end the run plans poses again that it did not complete.
         """
         context, run = self.context, self._run
-        self._void()
+        self.approvals.void()
         context.requests = RunRequests(halt=True)
         self.store.enter(state, reason, cause)
         if run is not None:
@@ -202,22 +200,20 @@ class Session:
         context = self.context
         self.permit(verbs.Prepare, client_id)
         await self._run_ended()  # its control process may still be ending
-        self._void()
+        self.approvals.void()
         voids = self.approvals.voids
         if stop_test is not None:
             motion = await stop_motion(context, stop_test)
         else:
             await look_back(context)
             motion = session_motion(context, purpose)
-        preview = await previewed(context, motion)
+        offer = await offered(context, motion, client_id)
         await context.cell.require_mover().may_start()
         self.permit(verbs.Prepare, client_id)
         if self.approvals.voids != voids:
             raise RefusedError("changed")
-        self.approvals.offer(MotionApproval(motion, preview, client_id))
-        # Watchers get it without the token, which is for the client that asked.
-        self.store.update(go=msgspec.structs.replace(preview, token=""))
-        return preview
+        self.approvals.offer(offer)
+        return offer.preview
 
     async def go(self, client_id: int, token: str, approval: str = "") -> None:
         """Start the offered motion, which a person approved. RefusedError when anything changed.
@@ -233,11 +229,8 @@ class Session:
             raise RefusedError("still-ending", what="freedrive")
         queue = context.queue
         sha256 = approval_sha256(queue.plan, context.cell.config) if queue else ""
-        try:
-            go = self.approvals.redeem(token, client_id, sha256, joints)
-            go = replace(go, approval=approval or f"motion approved by {self.store.status.lease.holder}")
-        finally:
-            self.store.update(go=None)
+        go = self.approvals.redeem(token, client_id, sha256, joints)
+        go = replace(go, approval=approval or f"motion approved by {self.store.status.lease.holder}")
         context.requests = RunRequests()
         run, motion = Run(context, go), go.motion
         if motion.stop_test is None:
@@ -259,7 +252,7 @@ class Session:
     async def finish(self, client_id: int) -> None:
         """Finish the recording, after the pose under way."""
         self.permit(verbs.Finish, client_id)
-        self._void()
+        self.approvals.void()
         if self.store.state in RUNNING and not self.freedrive.taking:
             self.context.requests.finish = True
             self.store.event("finish-wanted", "finish after this pose")
@@ -334,7 +327,7 @@ class Session:
             raise RefusedError("session-open")
 
     def _replace_plan(self, plan: Plan) -> None:
-        self._void()
+        self.approvals.void()
         self.context.queue = PoseQueue(plan)
         self.context.forget_session()
         self.context.show_poses()
@@ -354,7 +347,7 @@ class Session:
             return
         change = queue.retake if isinstance(verb, verbs.Retake) else queue.skip
         change(verb.index)
-        self._void()
+        self.approvals.void()
         context.show_poses(self.store.status.session.current)
         if context.recording is not None:
             try:
@@ -364,7 +357,7 @@ class Session:
 
     async def switch_free_drive(self, client_id: int, on: bool, check: bool = False) -> None:
         self.permit(verbs.Freedrive, client_id)
-        self._void()
+        self.approvals.void()
         if on:
             await self._run_ended()
             await self.freedrive.begin(check)
@@ -398,8 +391,3 @@ class Session:
         if verb.moves:
             self.context.cell.require_mover()
         verb.require(self.store.state)
-
-    def _void(self) -> None:
-        """Withdraw the motion that is offered for approval, if any."""
-        self.approvals.void()
-        self.store.update(go=None)

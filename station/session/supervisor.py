@@ -62,7 +62,6 @@ class Monitor:
         shown = RobotStatus(
             identity=arm.identity,
             remote=mover.remote if mover else None,
-            control=mover is not None and mover.control,
             control_path=mover.control_path if mover else "",
             not_accepted=self._not_accepted,
             speed_limit_m_s=min(context.cell.config.limits.speed_m_s, SPEED_CAP_M_S),

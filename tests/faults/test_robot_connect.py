@@ -9,15 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from recordings.errors import ErrorData
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError
+from station.devices import ur_link
 from station.devices.rtde import RobotMode
 from station.devices.ur import UrRobot
-from station.devices.ur_state import Sample, StateReader
 from station.simulation.launch import SimulatedController, start_controller
 from tests.codes import raises
 from tests.conftest import check_allow_list
@@ -88,15 +87,10 @@ async def test_a_silent_controller_does_not_hang_the_station(
 async def test_no_tool_is_taken_from_a_controller_that_is_still_starting(
     arm: SimulatedController, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot, opened = robot_at(arm.host, tmp_path), StateReader.open
-
-    async def starting(reader: StateReader) -> Sample:
-        sample = await opened(reader)
-        state = msgspec.structs.replace(sample.state, robot_mode=RobotMode.BOOTING)
-        return sample._replace(state=state)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(StateReader, "open", starting)
+    robot = robot_at(arm.host, tmp_path)
+    with arm.admin() as admin, monkeypatch.context() as patch:
+        admin.ask("power_off")  # in place of booting, which the simulator does not show
+        patch.setattr(ur_link, "STARTING", (RobotMode.POWER_OFF,))
         with raises("not-powered"):
             await robot.connect()
     await robot.connect()

@@ -106,17 +106,6 @@ async def test_stop_before_the_control_process_exists(
     assert c.control_pid is None and await c.asked("upload") == 0
 
 
-async def test_a_new_approval_right_after_a_stop(cell: MakeCell) -> None:
-    c = await cell()
-    move = await c.cruising()
-    await c.robot.stop("operator")
-    with pytest.raises(RobotError):
-        await move
-    await c.begin()  # waits for the old control to be gone
-    assert c.robot.control
-    await c.arrives(c.near())
-
-
 async def test_a_cancelled_move_stops_the_arm(cell: MakeCell) -> None:
     c = await cell()
     move = await c.cruising()

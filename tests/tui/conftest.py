@@ -150,7 +150,7 @@ def idle(state: StationState = StationState.IDLE, reason: str = "") -> StationSt
         simulated=True,
         robot=RobotStatus(RobotIdentity("UR10"), make_state(0), ArmCondition(safety="NORMAL"), remote=True),
         camera=CameraStatus(CameraIdentity(model="MER-131-75GM")),
-        session=SessionStatus(name="s-1", poses=poses, plan_sha256="ab" * 32),
+        session=SessionStatus(name="s-1", poses=poses),
     )
 
 

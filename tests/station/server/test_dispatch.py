@@ -114,20 +114,6 @@ async def test_poses_of_a_check_are_planned_for_a_known_lens(
     assert asked == [True, False]
 
 
-async def test_a_screen_at_which_nobody_is_may_say_that_it_is_lost(served: Served, small_plan: Plan) -> None:
-    async with await served.client() as anna:
-        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
-        served.rig.arm.slow = True
-        offer = await anna.request("prepare")
-        await anna.request("go", token=offer["token"], approval_sha256=offer["approval_sha256"])
-        await served.rig.until(StationState.MOVING)
-        await anna.request("release", silent=True)
-        assert served.rig.state is StationState.PAUSED
-        assert ME in served.rig.session.store.status.reason
-        assert served.rig.cause == "control-lost"
-        assert served.rig.session.store.status.lease.holder == ""
-
-
 @pytest.mark.parametrize(
     ("verb", "args"),
     [
@@ -274,13 +260,6 @@ async def test_a_person_at_a_terminal_approves_when_the_configuration_lets_them(
     await served.control.close()
 
 
-async def test_watchers_are_not_told_the_token(served: Served, small_plan: Plan) -> None:
-    async with await served.client() as anna:
-        summary = await offered(anna, small_plan)
-        shown = served.rig.session.store.status.go
-    assert shown is not None and summary["token"] and not shown.token
-
-
 def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
     program = (
         "import os, signal, sys\nfrom station.server.approval import process\n"
@@ -307,19 +286,6 @@ def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
         [sys.executable, "-c", alone], start_new_session=True, capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "''"
-
-
-async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
-    async with await served.client() as anna:
-        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
-        summary = await anna.request("prepare")
-    async with await served.client() as bert:
-        await until(lambda: not served.rig.session.store.status.lease.holder)
-        with raises("no-control"):
-            await bert.request("go", token=summary["token"])
-        await bert.request("skip", index=0)
-        with raises("approval-used"):
-            await bert.request("go", token=summary["token"])
 
 
 async def test_stop_without_a_connection_is_named_by_the_persons_terminal(served: Served) -> None:

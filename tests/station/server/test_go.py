@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 
-import msgspec
 import pytest
 
 from station.cell.errors import RefusedError
@@ -36,9 +35,8 @@ def offered(manager: ApprovalManager, client_id: int = 1) -> MotionApproval:
     preview = MotionPreview(
         secrets.token_urlsafe(16), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
     )
-    preview = msgspec.structs.replace(preview, start_joints_rad=HERE)
     motion = Motion(Purpose.RUN, PoseQueue(Plan("UR10", "eye-in-hand", ())), (0, 1, 2, 3))
-    manager.offer(MotionApproval(motion, preview, client_id))
+    manager.offer(MotionApproval(motion, preview, client_id, HERE))
     return manager.waiting
 
 

@@ -85,7 +85,7 @@ async def test_stop_and_a_lost_client_end_it_while_it_approves_again(
         await (rig.session.stop("ben") if how == "stop" else rig.session.lease_lost(1))
 
     summary = await rig.session.prepare(1, "run")
-    monkeypatch.setattr("station.session.run.previewed", ended_meanwhile)
+    monkeypatch.setattr("station.session.run.offered", ended_meanwhile)
     monkeypatch.setattr(rig.arm, "move", _late)
     context = rig.session.context
     context.cell = replace(context.cell, own_simulator=True)

@@ -135,7 +135,7 @@ async def test_a_run_that_cannot_be_made_leaves_the_station_at_rest(
     monkeypatch.setattr(run, "cell_geometry", broken)
     with pytest.raises(ZeroDivisionError):
         await rig.session.go(1, summary.token)
-    assert rig.state is S.IDLE and rig.session.store.status.go is None
+    assert rig.state is S.IDLE and rig.session.approvals.waiting is None
 
 
 async def test_nothing_new_begins_beside_a_run_that_does_not_end(

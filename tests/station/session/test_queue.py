@@ -61,5 +61,5 @@ def test_another_session_leaves_out_what_was_left_out_and_on_wish_what_a_hand_fo
     queue.skip(2)
     again = queue.anew()
     assert [status.state for status in again.statuses] == ["planned"] * 2 + ["skipped"] + ["planned"] * 2
-    assert again.status(0).attempt == 0 and again.sha256 == queue.sha256
+    assert again.status(0).attempt == 0 and again.plan == queue.plan
     assert [status.name for status in queue.anew(guided=False).statuses] == ["p0", "p1", "p2", "p3"]

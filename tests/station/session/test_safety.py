@@ -102,7 +102,7 @@ async def test_what_changes_leaves_no_approval(rig: Rig, change: str, offered: b
     if change == "prepare" and not offered:
         assert (await later).poses == POSES
     else:
-        assert rig.session.store.status.go is None
+        assert rig.session.approvals.waiting is None
 
 
 async def test_a_robot_that_was_lost_voids_the_go(rig: Rig) -> None:
@@ -113,7 +113,7 @@ async def test_a_robot_that_was_lost_voids_the_go(rig: Rig) -> None:
         await rig.session.prepare(1, Purpose.RUN)
     rig.arm.lost = False
     await rig.until(S.IDLE)
-    assert rig.session.store.status.go is None
+    assert rig.session.approvals.waiting is None
     with raises("approval-used"):
         await rig.session.go(1, summary.token)
 

@@ -183,7 +183,7 @@ async def test_no_motion_is_offered_while_nobody_knows_where_the_camera_is(
     context.cell = replace(context.cell, config=config)
     with raises("no-guess"):
         await rig.session.prepare(1, stop_test=test)
-    assert rig.session.store.status.go is None
+    assert rig.session.approvals.waiting is None
     context.cell = replace(context.cell, source="playback")  # no arm moves
     await rig.session.prepare(1, stop_test=test)
 
@@ -192,7 +192,7 @@ async def test_nobody_approves_what_the_arm_will_refuse(rig: Rig, monkeypatch: p
     monkeypatch.setattr(rig.arm, "may_start", AsyncMock(side_effect=RobotError("local-control")))
     with raises("local-control"):
         await rig.session.prepare(1, Purpose.RUN)
-    assert rig.session.store.status.go is None
+    assert rig.session.approvals.waiting is None
 
 
 async def test_a_refused_control_leaves_everything_as_it_was(rig: Rig, tmp_path: Path) -> None:

@@ -88,13 +88,6 @@ async def test_a_stop_before_the_move_was_sent(cell: MakeCell, monkeypatch: pyte
     await gone(c)
 
 
-async def test_a_heart_that_beats_late_is_in_time(cell: MakeCell) -> None:
-    c, starting = await unheard(cell)
-    c.beating = True
-    await starting
-    assert c.robot.control
-
-
 BEFORE_THE_FIRST: dict[str, tuple[Any, bool, str]] = {
     "no heartbeat": (lambda c: None, False, "no-heartbeat"),
     "STOP": (lambda c: c.robot.stop("changed my mind"), False, "stopped"),

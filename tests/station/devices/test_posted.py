@@ -161,18 +161,6 @@ async def test_poses_without_a_time_are_of_their_arrival_within_a_stated_bound(a
     assert found.tcp_pose[:3] == tuple(POSE[:3]) and found.joints_rad == ()  # told after that moment alone
 
 
-async def test_no_other_file_is_made_with_the_sockets_permissions(tmp_path: Path) -> None:
-    arm = PostedArm(config(), "real", tmp_path / "control.sock")
-    connecting = asyncio.create_task(arm.connect())
-    await asyncio.sleep(0)
-    (tmp_path / "another").mkdir()
-    await until(lambda: arm._servers)
-    assert len(arm._servers) == 1 and not arm.token_file.exists()
-    connecting.cancel()
-    await arm.close()
-    assert (tmp_path / "another").stat().st_mode & 0o700 == 0o700
-
-
 WRONG = {
     "millimetres": ({"base_from_flange": [400.0, -200.0, 300.0, *POSE[3:]]}, "post-too-far"),
     "a quaternion that is none": ({"base_from_flange": [*POSE[:3], 0.5, 0.1, 0.3, 0.8, ]}, "post-rotation"),

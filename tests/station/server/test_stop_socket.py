@@ -367,6 +367,10 @@ def test_in_a_folder_that_others_may_enter_a_socket_is_its_owners_alone(tmp_path
         with socket.socket(socket.AF_UNIX) as link:
             bind(link, path)
         assert stat.S_IMODE(path.stat().st_mode) == mode
+        path.with_suffix("").mkdir()
+        assert path.with_suffix("").stat().st_mode & 0o700 == 0o700, (
+            "no other file is made as the sockets are"
+        )
 
 
 def test_two_daemons_of_one_folder_share_no_file(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.geometry import (
     Array,
@@ -220,10 +221,10 @@ def joint_readings(joints_rad: Array) -> Iterator[tuple[Array, str]]:
         yield coupled, f"with joint {joint + 1} read as itself {word} joint {joint}"
 
 
-def read_otherwise(joints_rad: Array, flanges: Array) -> tuple[Array, str] | None:
-    """Find the reading of joints that do not explain the flanges: the joints so read, and what was done."""
+def read_otherwise(joints_rad: Array, flanges: Array, used: NDArray[np.bool_]) -> tuple[Array, str] | None:
+    """Find the reading of joints (m, n) that explains the used flanges: joints so read, what was done."""
     for joints, done in joint_readings(joints_rad):
-        if done and learn_chain(joints, flanges, _QUICK).explains:
+        if done and learn_chain(joints[used], flanges[used], _QUICK).explains:
             return joints, done
     return None
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.chain import Chain, LearnedChain, chain_of, learn_chain, read_otherwise, wrong_row
 from calibrate.geometry import Array, difference
@@ -34,22 +35,24 @@ class ArmPostures:
     """The Universal Robots table that `chain` restates; None: the chain was learned."""
 
 
-def arm_postures(views: ViewSet) -> tuple[ArmPostures | None, str]:
+def arm_postures(views: ViewSet, used: NDArray[np.bool_]) -> tuple[ArmPostures | None, str]:
     """Read the recorded joints and find their kinematics: the table that the flanges follow, else learned.
 
-    Without joints: one branch of inverse kinematics that reaches all recorded flanges. None where there are
-    no joints and the robot's model is unknown, or neither a table nor a chain explains the flanges. The text
-    says what is unusual about the joints.
+    used: (n,) the views whose flanges have to follow. Without joints: one branch of inverse kinematics that
+    reaches all recorded flanges. None where there are no joints and the robot's model is unknown, or neither
+    a table nor a chain explains the flanges. The text says what is unusual about the joints.
     """
     flanges, joints = views.base_from_flange, recorded_joints(views)
     published, note = MODELS.get(views.robot_model), ""
+    if joints is None and any(view.joints_rad is not None for view in views):
+        note = "Poses lack joints, or some: none are used. Record them with every pose."
     model = None if published is None else with_near_axes(views.arm or published)
     if joints is not None:
         if model is not None and joints.shape[1] == 6:
             chain = chain_of(model)
-            if LearnedChain(chain, difference(chain.forward(joints), flanges)).explains:
+            if LearnedChain(chain, difference(chain.forward(joints), flanges)[used]).explains:
                 return ArmPostures(chain, joints, True, model), ""
-        learned, joints, note = _learned(joints, views)
+        learned, joints, note = _learned(joints, views, used)
         if learned.explains:
             return ArmPostures(learned.chain, joints, True), note
     if published is None or model is None:
@@ -58,21 +61,26 @@ def arm_postures(views: ViewSet) -> tuple[ArmPostures | None, str]:
     return (None if found is None else ArmPostures(chain_of(model), found, False, model)), note
 
 
-def _learned(joints: Array, views: ViewSet) -> tuple[LearnedChain, Array, str]:
-    """Learn a chain: it, the joints as they were read, and what is unusual about them."""
+def _learned(joints: Array, views: ViewSet, used: NDArray[np.bool_]) -> tuple[LearnedChain, Array, str]:
+    """Learn a chain from the used views: it, the joints as they were read, and what is unusual about them."""
     flanges = views.base_from_flange
-    learned = learn_chain(joints, flanges)
+    learned = learn_chain(joints[used], flanges[used])
     if learned.explains:
         return learned, joints, ""
-    read = read_otherwise(joints, flanges)
+    read = read_otherwise(joints, flanges, used)
     if read is not None:
-        return learn_chain(read[0], flanges), read[0], f"The recorded joints fit the poses {read[1]}."
+        return (
+            learn_chain(read[0][used], flanges[used]),
+            read[0],
+            f"The recorded joints fit the poses {read[1]}.",
+        )
     shift, turn = learned.rms
     note = f"The recorded joints do not explain the poses ({1e3 * shift:.1f} mm, {np.degrees(turn):.1f}°). "
-    row = wrong_row(learned, joints, flanges)
+    row = wrong_row(learned, joints[used], flanges[used])
     if row is None:
         return learned, joints, note + "Check the order and unit of the joints."
-    return learned, joints, note + f"Without pose {views.views[row].index + 1} they do: look at its joints."
+    wrong = views.views[np.flatnonzero(used)[row]].index + 1
+    return learned, joints, note + f"Without pose {wrong} they do: look at its joints."
 
 
 def gravity_in_flange(flange: Array) -> Array:

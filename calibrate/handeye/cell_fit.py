@@ -98,11 +98,14 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
     plain, log_bayes, smooth, failure = found, None, None, ""
-    arm, joints_note = arm_postures(views)
-    if len(views) >= FEWEST_FOR_ARM_ERRORS:
+    arm, joints_note = None, ""
+    if plain.used.sum() >= FEWEST_FOR_ARM_ERRORS:
+        arm, joints_note = arm_postures(views, plain.used)
         flex = flex_motion(views.base_from_flange)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
-        smoothly = smooth_motion(observed.flange, flange_extent(observed.flange))
+        # A pose that is told metres away must neither set the range nor be explained by these errors.
+        extent = flange_extent(observed.flange[plain.used])
+        smoothly = smooth_motion(observed.flange, extent) * plain.used[:, None, None]
         STAGES.info("3 of 4: errors of the arm")
 
         def with_errors(by_arm: Array) -> tuple[Observations, Estimate, float | None]:

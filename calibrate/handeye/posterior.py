@@ -40,7 +40,8 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     found = fit.estimate if smooth is None else smooth
     state, scales, kept = found.state, found.scales, Layout.of(found.state).all_but_board
     flanges = fit.views.base_from_flange
-    level, extent = gravity_in_flange(flanges).mean(axis=0), flange_extent(flanges)
+    level = gravity_in_flange(flanges).mean(axis=0)
+    extent = flange_extent(flanges[fit.plain.used])
     return Posterior(
         X=_rows(state.X),
         lens=intrinsics_vector(state.camera).tolist(),

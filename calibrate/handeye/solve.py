@@ -144,7 +144,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     H, C = mount_poses(views.base_from_flange, views.mount), found.board_poses
     parent, child = camera_frames(views.mount)
     distance = options.working_distance_m or median_distance_m(C[used])
-    stated = _common_error(views, state.X, options) if fit.arm is None else np.zeros((6, 6))
+    stated = _common_error(views.select([*used]), state.X, options) if fit.arm is None else np.zeros((6, 6))
     by_unknown_arm = stated + fit.unknown_arm
     covariance = found.covariance[:6, :6] + by_unknown_arm
     arm = _arm(fit, found.covariance[at.arm_errors, at.arm_errors], options, distance)

@@ -26,8 +26,6 @@ NAMES = ("rotation x", "rotation y", "rotation z", "translation x", "translation
 class PaperResult:
     X: Array
     """(4, 4)"""
-    vector: Array
-    """(6,) [γ; b] (eq. 15)"""
     objective: QuadraticObjective
     on_box: tuple[str, ...]
     """Components of x on a bound: the true camera probably lies outside the box."""
@@ -38,7 +36,7 @@ def solve_paper(pairs: Pairs, seed: int) -> PaperResult:
     objective = build_objective(pairs, "log", WEIGHT)
     x = evolve(paper_evaluate(objective), -BOX, BOX, np.random.default_rng(seed), SETTINGS)
     X = pose(rotation_exp(x[:3]), x[3:])
-    return PaperResult(X, x, objective, on_box(x))
+    return PaperResult(X, objective, on_box(x))
 
 
 def on_box(vector: Array) -> tuple[str, ...]:

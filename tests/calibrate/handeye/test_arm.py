@@ -17,7 +17,7 @@ from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import solve_views
 from calibrate.views import ViewSet
 from recordings.schema.messages import Mount
-from tests.calibrate.cells import LOW, MOUNTS, QUICK, changed, error_mm_deg, inside
+from tests.calibrate.cells import LOW, MOUNTS, QUICK, changed, error_mm_deg, inside, with_flange
 from tests.calibrate.chains import arm_cell
 from tests.calibrate.worn_cell import worn_cell
 
@@ -147,7 +147,7 @@ def test_a_fit_of_errors_that_fails_is_said_and_does_not_cost_the_other(failing,
 
 
 def motion_of(views: ViewSet) -> Array:
-    arm, _ = arm_postures(views)
+    arm, _ = arm_postures(views, np.full(len(views), True))
     return arm.chain.by_links(arm.joints_rad)
 
 
@@ -165,9 +165,11 @@ def test_joints_are_read_or_else_found_in_one_branch():
 @pytest.mark.parametrize("model", ["unknown", "UR3"])
 def test_an_unknown_or_impossible_arm_is_learned_from_its_joints_alone(model):
     views = replace(worn_views(0.0), robot_model=model)
-    arm, note = arm_postures(views)
+    every = np.full(len(views), True)
+    arm, note = arm_postures(views, every)
     assert arm.table is None and not note
-    assert arm_postures(without_joints(views)) == (None, "")
+    assert arm_postures(without_joints(views), every) == (None, "")
+    assert arm_postures(changed(views, [3], joints_rad=lambda _: None), every)[1]
 
 
 @pytest.mark.parametrize(
@@ -184,6 +186,18 @@ def test_an_arm_nobody_described_is_honest_and_better_by_its_joints(name, mount)
         assert solved[0].arm.detected and solved[0].arm.uncorrected is not None
     with_joints, without = np.sqrt(np.mean(np.square(errors), axis=0))
     assert all(covered) and with_joints < 0.8 * without
+
+
+@MOUNTS
+def test_wrong_poses_cost_no_more_than_their_views(mount):
+    """Two exchanged, one ten metres away: neither is the arm forgotten nor the stated error larger."""
+    cell = arm_cell("spherical wrist", mount, 0.3, 3)
+    flange = cell.views.base_from_flange
+    flange[[4, 11]], flange[7, 0, 3] = flange[[11, 4]], 10.0
+    spoilt, good = with_flange(cell.views, flange), [i for i in range(25) if i not in (4, 7, 11)]
+    assert inside(solution := solve_views(spoilt, QUICK), cell.X) and solution.arm.detected
+    spoilt, sound = (solve_views(without_joints(views), QUICK) for views in (spoilt, cell.views.select(good)))
+    assert spoilt.sigma_translation_m == pytest.approx(sound.sigma_translation_m, rel=0.1)
 
 
 @MOUNTS

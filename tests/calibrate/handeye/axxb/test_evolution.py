@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calibrate.geometry import pose, rotation_exp
 from calibrate.handeye.axxb.evolution import EvolutionSettings, _partners, evolve
 from calibrate.handeye.axxb.pairs import consecutive_pairs
 from calibrate.handeye.axxb.paper import BOX, SETTINGS, solve_paper
@@ -43,7 +44,8 @@ def test_same_seed_gives_the_same_X_by_form_and_by_pair_loops(seed):
     by_form = solve_paper(pairs, seed)
     rng = np.random.default_rng(seed)
     by_loops = evolve(pair_loop_objective(pairs), -BOX, BOX, rng, SETTINGS)
-    np.testing.assert_allclose(by_form.vector, by_loops, rtol=0, atol=1e-12)
+    expected = pose(rotation_exp(by_loops[:3]), by_loops[3:])
+    np.testing.assert_allclose(by_form.X, expected, rtol=0, atol=1e-12)
 
 
 def test_partners_are_three_different_others():

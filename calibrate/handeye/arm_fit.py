@@ -66,10 +66,6 @@ class _Sizes:
         bend = RIGID if one[2] == 0 else (1 - RIGID) / (len(BENDS) - 1)
         return float(np.log(bend / (self.shape[0] * self.shape[1])))
 
-    def log_joint(self, found: dict[Sizes, LinearSolution]) -> Array:
-        """Log probability (s,) of each combination and of what was measured."""
-        return np.array([self.log_chance(one) + solution.log_evidence for one, solution in found.items()])
-
     def beside(self, one: Sizes) -> list[Sizes]:
         """Return the combinations in which one size is the next smaller or larger."""
         steps = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)]) + one
@@ -96,8 +92,7 @@ def estimate_with_arm_errors(
     settled = estimate(observed, state, priors, scales, fit="robot")
     linear = Linear.at(observed, settled.state, settled.corner_weights)
     solve = partial(_solve, linear, priors, settled.state)
-    kept = _explore(sizes, solve, settled.scales)
-    solutions, log_joint = list(kept.values()), sizes.log_joint(kept)
+    kept, solutions, log_joint = _explore(sizes, solve, settled.scales)
     log_all = float(special.logsumexp(log_joint))
     log_bayes = log_all - solve(sizes.sigma(_NONE), plain.scales).log_evidence
     chances = np.exp(log_joint - log_all)
@@ -136,8 +131,11 @@ def _solve(linear: Linear, priors: Priors, state: CellState, sigma: Array, start
 
 def _explore(
     sizes: _Sizes, solve: Callable[[Array, Scales], LinearSolution], scales: Scales
-) -> dict[Sizes, LinearSolution]:
-    """Solve the alike combinations, then the neighbours of every likely one; return the likely ones."""
+) -> tuple[list[Sizes], list[LinearSolution], Array]:
+    """Solve the alike combinations, then the neighbours of every likely one.
+
+    Returns the likely ones, their solutions, and the log probability (s,) of each and of what was measured.
+    """
     found: dict[Sizes, LinearSolution] = {}
     chance: dict[Sizes, float] = {}
     ahead = [(one, scales) for one in sizes.alike]
@@ -149,5 +147,5 @@ def _explore(
         chance[one] = sizes.log_chance(one) + found[one].log_evidence
         if chance[one] > max(chance.values()) + _LEAST:
             ahead += [(other, found[one].scales) for other in sizes.beside(one)]
-    least = max(chance.values()) + _LEAST
-    return {one: solution for one, solution in found.items() if chance[one] > least}
+    kept = [one for one in found if chance[one] > max(chance.values()) + _LEAST]
+    return kept, [found[one] for one in kept], np.array([chance[one] for one in kept])

@@ -42,19 +42,13 @@ def evolve(
     partners = _partners(rng, s.generations, s.population)
     stays = rng.random((s.generations, s.population, d)) > s.crossover
     values = evaluate(x)
-    chosen = np.empty((3, s.population, d))
     for partner, stay in zip(partners, stays, strict=True):
-        base, trial, minus = x.take(partner, axis=0, out=chosen, mode="clip")
-        trial -= minus
-        trial *= s.factor
-        trial += base
-        np.maximum(trial, lower, out=trial)
-        np.minimum(trial, upper, out=trial)
-        np.copyto(trial, x, where=stay)
+        base, plus, minus = x[partner]
+        mutant = np.minimum(np.maximum(base + s.factor * (plus - minus), lower), upper)
+        trial = np.where(stay, x, mutant)
         trial_values = evaluate(trial)
         better = trial_values <= values
-        np.copyto(x, trial, where=better[:, None])
-        np.copyto(values, trial_values, where=better)
+        x, values = np.where(better[:, None], trial, x), np.where(better, trial_values, values)
     return np.asarray(x[np.argmin(values)])
 
 

@@ -51,10 +51,8 @@ def run() -> str:
 def line(case: tuple[str, Mount, float], cells: list[tuple[float, ...]]) -> list[str]:
     found = 100 * np.array(cells)
     spread = found.std(axis=0, ddof=1) / np.sqrt(len(found))
-    shares = [f"{share:.1f}" for share in found.mean(axis=0)]
-    for alarms in (0, 3):
-        shares[alarms] += f" ± {spread[alarms]:.1f}"
-    return [*map(str, case), *shares]
+    shares = zip(found.mean(axis=0), spread, strict=True)
+    return [*map(str, case), *(f"{share:.1f} ± {error:.1f}" for share, error in shares)]
 
 
 def production(count: int) -> str:

@@ -98,9 +98,8 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
     plain, log_bayes, smooth, failure = found, None, None, ""
-    arm, joints_note = None, ""
+    arm, joints_note = arm_postures(views, plain.used)
     if plain.used.sum() >= FEWEST_FOR_ARM_ERRORS:
-        arm, joints_note = arm_postures(views, plain.used)
         flex = flex_motion(views.base_from_flange)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
         # A pose that is told metres away must neither set the range nor be explained by these errors.

@@ -64,7 +64,6 @@ class Estimate:
     noise_parts: Array
     """(3,) variance of X, whitened, from corners, robot translation and robot rotation."""
     log_evidence: float
-    steps: int
     converged: bool
     mean_of: MeanParts = field(default_factory=MeanParts)
 
@@ -106,19 +105,20 @@ def estimate(
     the robot's times `wide`.
     Raises BadViewsError where views and priors together do not determine the unknowns.
     """
-    state, converged, steps = start, False, 0
+    state, converged = start, False
     weights = observed.present if scales is None else corner_weights(observed, state, scales.sigma_px)
     linear = Linear.at(observed, state, weights)
     scales = scales or linear.first_scales(wide)
     try:
-        while steps < MAX_STEPS and not converged:
-            steps += 1
+        for _ in range(MAX_STEPS):
             solved = linear.solve(priors.linearise(state, scales.arm_error_sigma), scales, fit)
             scales = solved.scales
             state = state.moved(solved.step, linear.board_step(solved))
             weights = corner_weights(observed, state, scales.sigma_px)
             converged = bool(solved.step @ solved.precision @ solved.step < _SETTLED**2)
             linear = Linear.at(observed, state, weights)
+            if converged:
+                break
         solved = linear.solve(priors.linearise(state, scales.arm_error_sigma), scales, "nothing")
         covariance = linear.covariance(solved)
     except np.linalg.LinAlgError as problem:
@@ -135,7 +135,6 @@ def estimate(
         corner_weights=weights,
         noise_parts=linear.noise_parts(solved, covariance),
         log_evidence=solved.log_evidence,
-        steps=steps,
         converged=converged,
     )
 

@@ -290,7 +290,7 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
     said = (
         (session.reading is not Reading.AS_RECORDED, session.reading.value, explain_text(session, fit.views)),
         (bool(suspects), "suspect-views", f"Suspect views, down-weighted: {suspects}. Retake them."),
-        (not found.converged, "not-converged", f"Not converged after {found.steps} iterations."),
+        (not found.converged, "not-converged", "The fit has not converged. Check the views, or take more."),
         (
             not fit.observed.has_pixels,
             "no-corners",

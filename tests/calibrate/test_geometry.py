@@ -65,13 +65,6 @@ def test_projection_gives_the_nearest_rotation() -> None:
     assert all(np.linalg.norm(noisy - best) <= np.linalg.norm(noisy - r) for r in rivals)
 
 
-def test_interpolation_ends_where_it_should() -> None:
-    a, b = g.pose_from_rotvec([0, 0, 0], [0, 0, 0.2]), g.pose_from_rotvec([1, 0, 0], [0, 0, 1.0])
-    np.testing.assert_allclose(g.interpolate(a, b, 0.0), a, atol=1e-12)
-    np.testing.assert_allclose(g.interpolate(a, b, 1.0), b, atol=1e-12)
-    np.testing.assert_allclose(g.rotation_log(g.interpolate(a, b, 0.5)[:3, :3]), [0, 0, 0.6], atol=1e-12)
-
-
 def test_logarithms_are_scipys_near_and_far_and_a_mirror_is_refused() -> None:
     rng = np.random.default_rng(3)
     for angle in (0.0, 1e-12, 1e-6, 0.3, 2.9, np.pi - 1e-9):

@@ -123,7 +123,7 @@ def test_noise_and_steps_are_those_of_the_fit_that_is_reported(monkeypatch):
     found = fit_cell(views, Priors(LensPrior.given(views.camera)), 0)
     reported, plain = (fit.noise_parts / fit.noise_parts.sum() for fit in (found.estimate, found.plain))
     assert reported[1:].sum() < 0.8 * plain[1:].sum(), "the table explains what was taken for noise"
-    assert found.estimate.converged and found.estimate.steps > 2
+    assert found.estimate.converged
     monkeypatch.setattr(estimate, "MAX_STEPS", 2)
     assert "not-converged" in {remark.code for remark in solve_views(views, QUICK).warnings}
 

@@ -80,13 +80,3 @@ def test_information_is_that_of_finite_differences(mount):
     np.testing.assert_allclose(
         found / np.outer(scale, scale), J.T @ J / 0.25 / np.outer(scale, scale), atol=1e-5
     )
-
-
-def test_more_views_never_hurt_and_robot_noise_always_does():
-    X, Y, _, E = scene("eye-in-hand", n=20)
-    each = view_information("eye-in-hand", LENS, E, X, Y, BOARD, NOISE).cumsum(axis=0)
-    spread = np.trace(covariance_of(each[4:], PRIOR)[:, :6, :6], axis1=1, axis2=2)
-    assert (np.diff(spread) < 0).all()
-    noisier = MeasurementNoise(0.2, 1e-3, 2e-3)
-    worse = view_information("eye-in-hand", LENS, E, X, Y, BOARD, noisier).sum(axis=0)
-    assert (np.diag(covariance_of(worse, PRIOR)) > np.diag(covariance_of(each[-1], PRIOR))).all()

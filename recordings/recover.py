@@ -182,7 +182,8 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> Reco
             rename_new(temporary, final)
         return replace(_told(final, segment), kept_original=original, lost_bytes=lost_bytes, losses=losses)
     except OSError as error:
-        raise disk_error("write", temporary, error, f"{source} is unchanged.") from error
+        advice = f"{source} is unchanged. Free space, or write elsewhere: -o FILE"
+        raise disk_error("write", temporary, error, advice) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -54,15 +54,15 @@ class StrictYamlError(ValueError):
         self.problems = problems
 
 
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
-    """Plain data of the YAML 1.2 core schema."""
+class _Loader(yaml.CSafeLoader):  # type: ignore[misc]  # yaml has no types
+    """Plain data of the YAML 1.2 core schema, numbers decimal only."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
 
 for _tag, _pattern, _first in (
-    ("null", r"~|null|", ["~", "n", ""]),
-    ("bool", r"true|false", list("tf")),
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
     ("int", r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
     ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan", list("-+.0123456789")),
 ):
@@ -71,14 +71,6 @@ _Loader.add_constructor(
     "tag:yaml.org,2002:float",
     lambda _, node: float(node.value.replace(".inf", "inf").replace(".nan", "nan")),
 )
-
-
-class _ProgramsLoader(yaml.CSafeLoader):  # type: ignore[misc]
-    """YAML 1.1 with the numbers of JSON and yaml-cpp, `1e-05`."""
-
-
-_EXPONENT = re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$")
-_ProgramsLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+0123456789"))
 
 
 def _refuse_traps(content: bytes, limit: int) -> None:
@@ -108,7 +100,7 @@ def load_plain(content: bytes) -> Any:
     """Plain data of a file that a program wrote. Raises StrictYamlError."""
     try:
         _refuse_traps(content, _BY_PROGRAMS_LIMIT)
-        return yaml.load(content, _ProgramsLoader)
+        return yaml.load(content, _Loader)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
         raise _no_yaml(error) from None
 

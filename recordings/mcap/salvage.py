@@ -7,6 +7,7 @@ is whole.
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import re
 import zlib
@@ -54,8 +55,8 @@ class Salvage:
 
     descriptor: int
     contents: Contents = field(default_factory=Contents)
-    chunks: list[tuple[int, int]] = field(default_factory=list)
-    """(place, length) of the content of each whole chunk."""
+    chunks: dict[bytes, tuple[int, int]] = field(default_factory=dict)
+    """Hash → (place, length) of the content of each whole chunk; one that stands there twice counts once."""
     lost_bytes: int = 0
     losses: list[str] = field(default_factory=list)
     """A sentence for each damaged place."""
@@ -66,7 +67,7 @@ class Salvage:
 
     def messages(self) -> Iterator[Message]:
         """Yield every message in file order; of channels that nobody declared, too."""
-        for place, length in self.chunks:
+        for place, length in self.chunks.values():
             records = parse_chunk(os.pread(self.descriptor, length, place))[1]
             for _, opcode, start, end in split(records):
                 if opcode == Opcode.MESSAGE:
@@ -83,7 +84,7 @@ class Salvage:
                 if not chunk.uncompressed_crc or min(heads, default=MESSAGE_HEAD.size) < MESSAGE_HEAD.size:
                     raise BadRecordError("the chunk has no checksum, or a message no head")
                 self.declare(records)
-                self.chunks.append((place, len(content)))
+                self.chunks.setdefault(hashlib.sha256(content).digest(), (place, len(content)))
             case Opcode.ATTACHMENT:
                 self.contents.add_attachment(content, exact=True)
             case Opcode.METADATA:

@@ -83,7 +83,7 @@ def explain_shortage(
         possible=len(group),
         wanted=wanted,
         limiting=", ".join(limiting) or "none alone",
-        advice=" ".join(_REMEDIES.get(limit, _KEPT_CLEAR) for limit in limiting),
+        advice=" ".join(dict.fromkeys(_REMEDIES.get(limit, _KEPT_CLEAR) for limit in limiting)),
     )
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibrate.boards.printing import draw_pattern, origin_mm
 from calibrate.geometry import Array
-from calibrate.projection import camera_matrix, project_pixels, undistort
+from calibrate.projection import camera_matrix, undistort
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.simulation.truth import Light as Light
 
@@ -85,10 +85,13 @@ def board_print(board: BoardSpec) -> BoardPrint:
 
 @dataclass(frozen=True, eq=False)
 class _LensTable:
-    """Ray (x, y, 1) of each pixel centre, its derivatives per pixel, and the vignetting."""
+    """Ray (x, y, 1) of each pixel's centre, its slopes, and the vignetting: (height, width) each."""
 
     x: Floats
     y: Floats
+    x_slopes: tuple[Floats, Floats]
+    """Of x: to the next pixel down, and to the right."""
+    y_slopes: tuple[Floats, Floats]
     vignetting: Floats
 
 
@@ -107,15 +110,9 @@ def render(
     lens = _lens(camera)
     gain = 10 ** (light.gain_db / 20)
     scale = WHITE_LEVEL * light.illumination * gain * light.exposure_us / FULL_SCALE_US
-    picture = np.full(lens.x.shape, TABLE_ALBEDO, dtype=np.float32)
-    window = _window(camera, board, camera_from_board, margin_px=4 + int(4 * light.blur_px))
-    if window is not None:
-        picture[window] = _reflectance(lens, window, camera_from_board, board_print(board))
-        if light.blur_px > 0:
-            blurred = cv2.GaussianBlur(
-                picture[window], (0, 0), light.blur_px, borderType=cv2.BORDER_REPLICATE
-            )
-            picture[window] = blurred
+    picture = _reflectance(lens, camera_from_board, board_print(board))
+    if light.blur_px > 0:
+        cv2.GaussianBlur(picture, (0, 0), light.blur_px, picture, borderType=cv2.BORDER_REPLICATE)
     picture *= lens.vignetting
     picture *= np.float32(scale)
     picture += np.float32(BLACK_LEVEL + 0.5)
@@ -146,66 +143,29 @@ def _lens(camera: CameraModel) -> _LensTable:
     u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
     K = camera_matrix(camera)
     rays = (undistort(camera, np.stack([u, v], axis=-1).reshape(-1, 2)) - K[:2, 2]) / np.diag(K)[:2]
-    x, y = rays.T.reshape(2, camera.height, camera.width)
+    x, y = np.asarray(rays.T.reshape(2, camera.height, camera.width), np.float32)
     corner = np.hypot(camera.width / 2, camera.height / 2)
     radius = np.hypot(u - camera.width / 2, v - camera.height / 2) / corner
     vignetting = 1.0 - VIGNETTING * radius**2
-    return _LensTable(x.astype(np.float32), y.astype(np.float32), vignetting.astype(np.float32))
+    return _LensTable(x, y, np.gradient(x), np.gradient(y), vignetting.astype(np.float32))
 
 
-def _window(
-    camera: CameraModel, board: BoardSpec, camera_from_board: Array, margin_px: int
-) -> tuple[slice, slice] | None:
-    """Find rows and columns that may show the sheet; None where it is outside the image."""
-    x0, y0, x1, y1 = board_print(board).sheet_m
-    corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
-    along = np.linspace(0.0, 1.0, 9)[:, None, None]
-    points = (corners + along * (np.roll(corners, -1, axis=0) - corners)).reshape(-1, 3)
-    in_camera = points @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
-    ahead = in_camera[:, 2] > 0.01
-    if not ahead.any():
-        return None
-    # The distortion polynomial may map points far outside back into the image: then use the whole image.
-    if not ahead.all() or np.abs(in_camera[:, :2] / in_camera[:, 2:]).max() > 1.0:
-        return slice(0, camera.height), slice(0, camera.width)
-    pixels, size = project_pixels(camera, in_camera), (camera.width, camera.height)
-    low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin_px, 0, size)
-    high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin_px + 1, 0, size)
-    return (slice(low[1], high[1]), slice(low[0], high[0])) if (low < high).all() else None
-
-
-def _reflectance(
-    lens: _LensTable, window: tuple[slice, slice], camera_from_board: Array, printed: BoardPrint
-) -> Floats:
-    """Compute the mean albedo over each pixel of the window."""
+def _reflectance(lens: _LensTable, camera_from_board: Array, printed: BoardPrint) -> Floats:
+    """Compute the mean albedo over each pixel."""
+    if camera_from_board[:3, 2] @ camera_from_board[:3, 3] <= 0:  # seen from behind: z points away
+        return np.full(lens.x.shape, TABLE_ALBEDO, dtype=np.float32)
     plane_from_ray = np.asarray(np.linalg.inv(camera_from_board[:3, [0, 1, 3]]), dtype=float)
-    front = camera_from_board[:3, 2] @ camera_from_board[:3, 3] > 0  # the board's z points away
-    x, y = lens.x[window], lens.y[window]
-    if not front:
-        return np.full(x.shape, TABLE_ALBEDO, dtype=np.float32)
-    value = _sample(plane_from_ray, x, y, printed)
+    value = _sample(plane_from_ray, lens.x, lens.y, printed)
     kernel = np.ones((3, 3), dtype=np.uint8)
     edge = cv2.dilate(value, kernel) != cv2.erode(value, kernel)
-    rows, columns = np.nonzero(edge)
-    if len(rows) == 0:
-        return value
     k = np.arange(_SAMPLES)[:, None]
     du, dv = (((n + 0.5) / _SAMPLES - 0.5).astype(np.float32) for n in (k, _STRIDE * k % _SAMPLES))
-    (xu, xv), (yu, yv) = _slopes(x, rows, columns), _slopes(y, rows, columns)
-    x_fine = x[rows, columns] + du * xu + dv * xv
-    y_fine = y[rows, columns] + du * yu + dv * yv
-    value[rows, columns] = _sample(plane_from_ray, x_fine, y_fine, printed).mean(axis=0)
+    x_fine, y_fine = (
+        ray[edge] + du * right[edge] + dv * down[edge]
+        for ray, (down, right) in ((lens.x, lens.x_slopes), (lens.y, lens.y_slopes))
+    )
+    value[edge] = _sample(plane_from_ray, x_fine, y_fine, printed).mean(axis=0)
     return value
-
-
-def _slopes(field: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Compute the derivatives of a field per pixel to the right and per pixel down."""
-    height, width = field.shape
-    left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, width - 1)
-    up, down = np.maximum(rows - 1, 0), np.minimum(rows + 1, height - 1)
-    to_right = (field[rows, right] - field[rows, left]) / np.maximum(right - left, 1).astype(np.float32)
-    to_down = (field[down, columns] - field[up, columns]) / np.maximum(down - up, 1).astype(np.float32)
-    return to_right, to_down
 
 
 def _sample(plane_from_ray: Array, x: Floats, y: Floats, printed: BoardPrint) -> Floats:

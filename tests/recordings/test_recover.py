@@ -179,6 +179,17 @@ def test_what_was_attached_behind_a_destroyed_record_is_found_again(tmp_path: Pa
     assert open_recording(path).attachments() == {f"plan-{k}.json": b"{}" * 50 for k in range(2)}
 
 
+def test_what_stands_in_the_file_twice_is_saved_once(small: Path) -> None:
+    """Blocks that a failing copy or file system wrote a second time."""
+    data, whole = small.read_bytes(), open_recording(small)
+    middle = whole.segments[0].messages(Topic.VIEW).addresses[1] + 20
+    small.write_bytes(data[:middle] + data[100:middle] + data[middle:])
+    (result,) = recover_recording(small)
+    saved = open_recording(small)
+    assert result.poses >= 2 and saved.views() == whole.views()[: result.poses]
+    assert len(list(saved.robot_states())) == len(set(saved.robot_states())) == result.robot_states
+
+
 @pytest.mark.parametrize("unfinished", [True, False], ids=["unfinished", "finished"])
 def test_a_lost_first_page_of_the_disk_leaves_the_other_poses(tmp_path: Path, unfinished: bool) -> None:
     make = write_unfinished if unfinished else write_small

@@ -18,8 +18,6 @@ from station.simulation.controller.kinematics import TABLES
 from station.simulation.controller.machine import Machine, precise_loop
 from station.simulation.controller.state import ArmTruth, Settings
 
-PARENT_POLL_S = 0.5
-
 _EPILOG = """\
 ports
   30004  RTDE                     30001-30003  URScript uploads
@@ -37,7 +35,6 @@ What is verified and what a real controller may do differently: docs/contributor
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parent = os.getppid()  # now: it surely lives while it waits for the ready line
     options = _parser().parse_args(arguments)
     if not _is_loopback(options.host):
         print(
@@ -54,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     try:
         with asyncio.Runner(loop_factory=precise_loop) as runner:
-            runner.run(_serve(options.host, settings, parent if options.die_with_parent else None))
+            runner.run(_serve(options.host, settings, options.die_with_parent))
     except OSError as error:
         print(
             f"cannot listen on {options.host}: {error.strerror or error}. Another controller runs on this "
@@ -87,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors")
     add("--local", dest="remote", action="store_const", const=False, help="start in local control (e-Series)")
     add("--time-scale", type=float, metavar="F", help="the arm moves F times faster; for tests")
-    add("--die-with-parent", action="store_true", help="end when standard input closes or the parent is gone")
+    add("--die-with-parent", action="store_true", help="end when standard input closes")
     return parser
 
 
@@ -100,8 +97,8 @@ def _settings(options: argparse.Namespace) -> Settings:
     return msgspec.convert(truth | given, Settings)
 
 
-async def _serve(host: str, settings: Settings, parent: int | None) -> None:
-    """Run until a signal, or until the parent is gone."""
+async def _serve(host: str, settings: Settings, ends_with_input: bool) -> None:
+    """Run until a signal, or until standard input ends, which it does when the parent dies."""
     loop = asyncio.get_running_loop()
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -116,28 +113,11 @@ async def _serve(host: str, settings: Settings, parent: int | None) -> None:
         raise
     ready = {"ready": True, "host": host, "model": settings.model, "pid": os.getpid()}
     print(json.dumps(ready), flush=True)
-    watch = loop.create_task(_parent_gone(ended, parent)) if parent is not None else None
+    if ends_with_input:
+        loop.add_reader(0, lambda: None if os.read(0, 4096) else ended.set())
     await ended.wait()
-    if watch is not None:
-        watch.cancel()
     admin.close()
     machine.close()
-
-
-async def _parent_gone(ended: asyncio.Event, parent: int) -> None:
-    """Standard input ends when the parent dies, unless a child it forked still holds the pipe: then the
-    parent's number tells."""
-    loop = asyncio.get_running_loop()
-
-    def read() -> None:
-        if not os.read(0, 4096):
-            ended.set()
-            loop.remove_reader(0)
-
-    loop.add_reader(0, read)
-    while os.getppid() == parent:
-        await asyncio.sleep(PARENT_POLL_S)
-    ended.set()
 
 
 if __name__ == "__main__":

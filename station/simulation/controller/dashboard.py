@@ -11,6 +11,7 @@ from station.devices.rtde import RuntimeState
 from station.simulation.controller.kinematics import read_table
 from station.simulation.controller.network import Connection, Service
 from station.simulation.controller.robot import SimulatedRobot
+from station.simulation.controller.urscript_parser import NOT_SUPPORTED
 
 PORT = 29999
 GREETING = "Connected: Universal Robots Dashboard Server"
@@ -50,8 +51,9 @@ class DashboardConnection(Connection):
     def _answer(self, verb: str) -> str:
         robot = self._robot
         if verb not in self._known:
-            robot.journal.note("dashboard", verb[:200], refused=True)
-            return f"could not understand: {verb}"
+            error = f"could not understand: {verb}{'' if verb in VERBS else f': {NOT_SUPPORTED}'}"
+            robot.journal.note("dashboard", verb[:200], refused=True, error=error[:300])
+            return error
         local = robot.settings.is_e_series and (not robot.remote or self._opened_in_local)
         refused = local and verb == "stop"
         robot.journal.note("dashboard", verb, refused=refused)

@@ -85,6 +85,12 @@ def compose(A: Rigid, B: Rigid) -> Rigid:
     )
 
 
+def turn_between(A: Rigid, B: Rigid) -> Rigid:
+    """The rotation from A's orientation to B's, seen from where both map to."""
+    a0, a1, a2, _, a4, a5, a6, _, a8, a9, a10, _ = A
+    return compose(B, (a0, a4, a8, 0.0, a1, a5, a9, 0.0, a2, a6, a10, 0.0))
+
+
 def from_rotvec(rx: float, ry: float, rz: float, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Rigid:
     """Rotation vector [rad] and translation [m] (Rodrigues' formula)."""
     angle = sqrt(rx * rx + ry * ry + rz * rz)

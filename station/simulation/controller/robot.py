@@ -5,8 +5,6 @@ Knows no socket, so that every rule here can be tested without one.
 
 from __future__ import annotations
 
-import logging
-
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
 from station.simulation.controller.arm import PROGRAM_END_RAD_S2, JointMotion, UnreachableError
 from station.simulation.controller.interpreted import InterpretedProgram
@@ -14,8 +12,6 @@ from station.simulation.controller.kinematics import Rigid, Vector, forward, nud
 from station.simulation.controller.state import ControllerState, Journal, Settings
 from station.simulation.controller.uploads import Upload
 from station.simulation.controller.urscript_parser import ScriptError, ScriptSyntaxError
-
-log = logging.getLogger(__name__)
 
 PROGRAM_START_S = 0.05
 WAITS = "while True:\n  sync()\nend"
@@ -69,6 +65,7 @@ class SimulatedRobot(ControllerState):
             if not late and not self.program.step():
                 self.stop_program("the program ended")
         except (ScriptError, UnreachableError) as error:
+            self.journal.note("controller", "runtime error", name=self.program.name, error=str(error))
             self.stop_program(f"runtime error: {error}")
 
     def receive_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
@@ -120,7 +117,6 @@ class SimulatedRobot(ControllerState):
             program = InterpretedProgram(self, name, upload.text)
         except ScriptSyntaxError as error:
             self.journal.note("controller", "syntax error", name=name, error=str(error))
-            log.warning("%s: %s", name, error)
             self.stop_program("replaced by a program that cannot start")
         else:
             self.start_program(program)

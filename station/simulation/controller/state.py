@@ -7,6 +7,7 @@ Programs see and change this; `robot` adds what the controller does by itself. T
 
 from __future__ import annotations
 
+import logging
 import random
 import time
 from collections import Counter, deque
@@ -27,15 +28,21 @@ from station.devices.rtde import (
 )
 from station.simulation.controller.arm import History, SimulatedArm
 from station.simulation.controller.kinematics import (
+    IDENTITY,
     TABLES,
     ArmGeometry,
+    Rigid,
     Vector,
     compose,
     forward,
     from_pose,
     read_table,
     to_pose,
+    to_rotvec,
+    turn_between,
 )
+
+log = logging.getLogger(__name__)
 
 ENTRIES = 20_000
 CB3_VERSION = (3, 15, 8, 106339)
@@ -107,9 +114,14 @@ class Journal:
         self._counts: Counter[str] = Counter()
 
     def note(self, source: str, verb: str, **details: object) -> None:
-        """source: dashboard, script, upload, rtde or controller (what it did by itself)."""
+        """source: dashboard, script, upload, rtde or controller (what it did by itself).
+
+        An `error` among the details also goes to standard error: no client is told why its program ended.
+        """
         self._counts[f"{source}: {verb}"] += 1
         self._entries.append({"monotonic_ns": time.monotonic_ns(), "source": source, "verb": verb, **details})
+        if error := details.get("error"):
+            log.warning("%s: %s", verb, error)
 
     def count(self, source: str, verb: str) -> None:
         """Count what comes many times a second."""
@@ -217,8 +229,8 @@ class ControllerState:
         """Time 0, empty registers; installation and the arm's place survive."""
         self.ticks, self.time_s, self.slider = 0, 0.0, 1.0
         self.history = History(self.dt_s)
-        self._posed: tuple[Vector, Vector] = ((), ())
-        """Joints and TCP for which the tool's pose was computed last."""
+        self._posed: dict[str, tuple[Vector, Vector, Rigid]] = {}
+        """Actual or target → joints, TCP and pose of the tool as they were computed last."""
         self.inputs, self.outputs = (
             VariableStore(VARIABLES[side], self.settings.is_e_series) for side in ("input", "output")
         )
@@ -230,6 +242,19 @@ class ControllerState:
         m, rad = self.settings.robot_sigma_m, self.settings.robot_sigma_rad
         return tuple(self._random.gauss(0.0, sigma) for sigma in (m, m, m, rad, rad, rad))
 
+    def _publish_tool(self, side: str, joints: Vector) -> None:
+        """Pose and speed of the tool, actual or target; the speed by the pose of the cycle before."""
+        before_joints, before_tcp, before = self._posed.get(side, ((), (), IDENTITY))
+        speed: Vector = ZEROS
+        if before_joints is not joints or before_tcp is not self.tcp:
+            tool = compose(forward(self.table, joints), from_pose(self.tcp))
+            self._posed[side] = joints, self.tcp, tool
+            self.outputs.set(f"{side}_TCP_pose", *to_pose(tool))
+            if before_tcp is self.tcp:
+                moved = (*(tool[i] - before[i] for i in (3, 7, 11)), *to_rotvec(turn_between(before, tool)))
+                speed = tuple(distance / self.dt_s for distance in moved)
+        self.outputs.set(f"{side}_TCP_speed", *speed)
+
     def publish(self) -> None:
         """The present state as RTDE output variables."""
         out, arm = self.outputs, self.arm
@@ -238,10 +263,8 @@ class ControllerState:
         out.set("actual_q", *arm.actual)
         out.set("target_qd", *arm.command_speed)
         out.set("actual_qd", *arm.actual_speed)
-        if self._posed[0] is not arm.actual or self._posed[1] is not self.tcp:
-            self._posed = arm.actual, self.tcp
-            tool = compose(forward(self.table, arm.actual), from_pose(self.tcp))
-            out.set("actual_TCP_pose", *to_pose(tool))
+        self._publish_tool("actual", arm.actual)
+        self._publish_tool("target", arm.command)
         out.set("target_speed_fraction", self.slider)
         out.set("speed_scaling", min(1.0, arm.scale / self.slider) if self.slider > 0 else 1.0)
         out.set("payload", self.payload_kg)

@@ -29,8 +29,7 @@ def test_replies_of_the_dashboard(controller) -> None:
         "get robot model": "UR10",
         "programState": "STOPPED <unnamed>",
         "stop": "Stopped",
-        "unlock protective stop": "could not understand: unlock protective stop",
-        "dance": "could not understand: dance",
+        "power on": "could not understand: power on: not supported by this simulator",
         "is in remote control": "could not understand: is in remote control",
     }
     assert dashboard(controller("UR10").host, *questions) == [GREETING, *questions.values()]

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calibrate.geometry import difference
+from calibrate.kinematics import MODELS, forward
 from station.simulation.controller.arm import SimulatedArm, Trapezoid
 from station.simulation.controller.kinematics import TABLES, Vector
 
@@ -64,3 +67,17 @@ def test_every_stop_misses_differently_and_never_jumps() -> None:
         seen.append(arm.miss[0])
     assert all(0 <= b - a < 0.05 for a, b in pairwise(seen))
     assert arm.miss[0] == 3.0  # a stop on the way is a stop: fully drawn anew
+
+
+def test_pose_and_speed_of_the_tool_are_those_of_the_joints(started) -> None:
+    made = started("  movej([0.5, -1.2, 1.0, -1.5, -1.0, 0.4], a=1.0, v=1.0)", model="UR10e")
+    made.run_until(lambda: made.speed_rad_s > 0.4)
+    told = made.robot.outputs.vector
+    for side in ("actual", "target"):
+        q, qd = np.array(told(f"{side}_q")), np.array(told(f"{side}_qd"))
+        later, now = (forward(MODELS["UR10e"], q + dt_s * qd) for dt_s in (1e-6, 0.0))
+        np.testing.assert_allclose(told(f"{side}_TCP_pose")[:3], now[:3, 3], atol=1e-9)
+        np.testing.assert_allclose(told(f"{side}_TCP_speed"), difference(later, now) / 1e-6, atol=2e-3)
+    made.end()
+    made.run(1.0)
+    assert told("actual_TCP_speed") == (0.0,) * 6

@@ -18,7 +18,6 @@ from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
 from tests.command_line import call
-from tests.durability import full
 from tests.recordings.small_recording import (
     START_NS,
     make_info,
@@ -76,14 +75,6 @@ def test_info_of_clocks_that_go_back_or_are_no_time(tmp_path: Path) -> None:
     plain = run("info", path, "--json").stdout
     states = json.loads(plain, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))["robot_states"]
     assert (states["count"], states["gaps"]) == (9, 0)
-
-
-def test_a_full_disk_behind_the_output_is_one_sentence_and_1(
-    small: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("recordings.cli.commands._print_info", full)
-    result = run("info", small)
-    assert result.returncode == 1 and len(result.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

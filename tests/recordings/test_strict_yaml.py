@@ -8,6 +8,7 @@ from typing import Literal
 
 import msgspec
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -43,6 +44,9 @@ def test_numbers_and_words_mean_what_they_look_like() -> None:
     outer = load(b"inner: {speed_m_s: 1e-3, name: no}\ncount: 10\npoint_m: [1, 2.5, -.5]\nmaybe: null", Outer)
     assert outer.inner == Inner(0.001, "no")
     assert outer.point_m == (1.0, 2.5, -0.5)
+    assert load_plain(b"[1e-05, -2E3, 12:30:45, True]") == [1e-05, -2000, "12:30:45", True]
+    texts = ["0128", "010", "no", "True", "~", "1e-3x"]
+    assert load_plain(yaml.safe_dump(texts).encode()) == texts
 
 
 def test_all_problems_come_in_one_report_with_their_lines() -> None:
@@ -107,8 +111,3 @@ def test_a_part_of_a_larger_file_is_read_with_the_files_lines() -> None:
     assert load(b"kind: b", Chosen, "kind_of_thing") == Chosen("b"), "a file of its own"
     with pytest.raises(StrictYamlError, match=r"line 3: part\.kin: unknown key; did you mean 'kind'"):
         load(b"x: 1\npart:\n  kin: b\n", Chosen, "part")
-
-
-def test_numbers_of_programs_without_a_point_are_numbers() -> None:
-    """As yaml-cpp writes them, and JSON."""
-    assert load_plain(b"[1e-05, -2E3, 1.5e3, 1e-5x]") == [1e-05, -2000.0, 1500.0, "1e-5x"]

@@ -17,30 +17,23 @@ def differ(of: str, *columns: tuple[float, ...]) -> dict[str, tuple[float, ...]]
     return {f"{of}_{name}": column for name, column in zip(names, columns, strict=True)}
 
 
-def test_the_true_flange_has_the_true_lengths_and_the_miss(stepped) -> None:
-    deltas = ((0, 1e-3, 0, 0, 0, 0), (0, 0, 0, 2e-3, 0, 0), (1e-3, 0, 0, 0, 0, 0), (0, 0, 2e-3, 0, 0, 0))
-    made = stepped(**differ("dh_delta", *deltas))
-    miss = (1e-4, -2e-4, 3e-4, 1e-3, 2e-3, -1e-3)
-    expected = perturb(station_forward(MODELS["UR10"].calibrated(*deltas), Q), np.array(miss))
-    found = np.array(made.robot.true_flange(Q, miss)).reshape(3, 4)
-    assert np.allclose(found, expected[:3], atol=1e-12)
-
-
-def test_a_factory_calibration_is_what_poses_follow(stepped) -> None:
+def test_poses_follow_the_factory_calibration_and_the_true_flange_its_errors_and_the_miss(stepped) -> None:
     far = (
         (0.0, 5e-4, 0, 0, 0, 0),
         (0, 0.6, -0.2, -0.4, 0, 0),
         (0, 1e-4, 2e-4, 0, 0, 0),
         (0, 1e-3, 0, 0, 0, 0),
     )
-    made = stepped(**differ("factory", *far), dh_delta_a_m=(0.0, 1e-3, 0, 0, 0, 0))
+    errors = ((0, 1e-3, 0, 0, 0, 0), (0, 0, 0, 2e-3, 0, 0), (1e-3, 0, 0, 0, 0, 0), (0, 0, 2e-3, 0, 0, 0))
+    made = stepped(**differ("factory", *far), **differ("dh_delta", *errors))
     made.run(0.1)
     own = MODELS["UR10"].calibrated(*far)
     reported = made.robot.outputs.vector("actual_TCP_pose")[:3]
     assert reported == pytest.approx(station_forward(own, made.robot.arm.actual)[:3, 3], abs=1e-12)
-    flange = np.array(made.robot.true_flange(Q, (0.0,) * 6)).reshape(3, 4)
-    worn = own.calibrated(a_m=(0.0, 1e-3, 0, 0, 0, 0))
-    assert np.allclose(flange, station_forward(worn, Q)[:3], atol=1e-12)
+    miss = (1e-4, -2e-4, 3e-4, 1e-3, 2e-3, -1e-3)
+    flange = np.array(made.robot.true_flange(Q, miss)).reshape(3, 4)
+    expected = perturb(station_forward(own.calibrated(*errors), Q), np.array(miss))
+    assert np.allclose(flange, expected[:3], atol=1e-12)
 
 
 def test_the_misses_have_the_sigma_they_were_asked_for_and_repeat_with_the_seed(stepped) -> None:

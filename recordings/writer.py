@@ -9,9 +9,9 @@ import math
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -67,7 +67,9 @@ class RecordingWriter:
         self.info = info
         self.error: RecordingError | None = None
         self._start_ns = info.created_wall_ns or time.time_ns()
-        self._channels: dict[Topic, _Channel] = {}
+        self._channels: dict[Topic, int] = {}
+        self._unnumbered = Counter[Topic]()
+        """Messages written so far that the caller does not number."""
         self._images: dict[int, int] = {}
         """Sequence → time in the file."""
         self._shown_ns = 0
@@ -247,50 +249,38 @@ class RecordingWriter:
         with self._disk():
             channel = self._channels.get(topic) or self._channel(topic)
             if sequence is None:
-                sequence = channel.messages
-                channel.messages += 1
-            self._mcap.add_message(channel.number, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
+                sequence = self._unnumbered[topic]
+                self._unnumbered[topic] += 1
+            self._mcap.add_message(channel, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
 
-    def _channel(self, topic: Topic) -> _Channel:
+    def _channel(self, topic: Topic) -> int:
         schema = self._mcap.register_schema(schema_name(topic), "protobuf", schema_bytes(topic))
-        number = self._mcap.register_channel(topic.value, "protobuf", schema)
-        self._channels[topic] = _Channel(number)
+        self._channels[topic] = self._mcap.register_channel(topic.value, "protobuf", schema)
         if not self._session:
             self._name_channel(topic)
         return self._channels[topic]
 
     def _name_channel(self, topic: Topic) -> None:
-        name = f"{CHANNEL_RECORDS}{self._channels[topic].number}"
+        name = f"{CHANNEL_RECORDS}{self._channels[topic]}"
         self._mcap.add_metadata(name, with_crc({"topic": topic.value}))
 
     @contextmanager
     def _disk(self) -> Iterator[None]:
-        """Guard a write: the first OSError closes the file, and every later write raises that error again."""
-        self._check_usable()
-        try:
-            yield
-        except OSError as error:
-            raise self._failed(error) from error
+        """Guard a write: the first OSError closes the file, and every later write raises that error again.
 
-    def _check_usable(self) -> None:
+        What is still in memory is dropped, as a writer that failed cannot be trusted.
+        """
         if self.error is not None:
             raise self.error
         if self._file.closed:
             raise RecordingError("closed", path=self.path)
-
-    def _failed(self, error: OSError) -> RecordingError:
-        """Close the file; what is still in memory is dropped, as a writer that failed cannot be trusted."""
-        remedy = "What was synced before is safe: free space or replace the disk, then "
-        self.error = disk_error("write", self.part_path, error, remedy + recover_line(self.part_path))
-        self._file.close()
-        return self.error
-
-
-@dataclass(slots=True)
-class _Channel:
-    number: int
-    messages: int = 0
-    """Written so far, where the caller does not number them."""
+        try:
+            yield
+        except OSError as error:
+            remedy = "What was synced before is safe: free space or replace the disk, then "
+            self.error = disk_error("write", self.part_path, error, remedy + recover_line(self.part_path))
+            self._file.close()
+            raise self.error from error
 
 
 @contextmanager

@@ -31,6 +31,8 @@ _LENS_SHARE = 0.02
 """Weight of the lens in criterion A, so that the views cover the image."""
 LINK_ERROR_MM = 0.3
 """1σ of the errors of an arm's links, assumed in planning, mm and mrad."""
+_SWEEPS = 6
+"""Exchanges of every chosen view, at most."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
 """From so many known views on, further ones are ranked by their first-order effect; so many are then
 evaluated exactly."""
@@ -125,13 +127,12 @@ def choose(
     objective: Objective,
     rng: np.random.Generator,
     keep: tuple[int, ...] = (),
-    sweeps: int = 6,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[int]:
     """Choose `count` members of the pool (n, p, p), greedily, then by exchanges until none helps.
 
-    `keep`: indices that stay chosen. Returns indices. Deterministic for a given state of rng; ties go to the
-    lower index.
+    `keep`: indices that stay chosen; the others are then chosen greedily only. Returns indices. Deterministic
+    for a given state of rng; ties go to the lower index.
     """
     chosen = list(keep) or [int(rng.integers(len(pool)))]
     total = pool[chosen].sum(axis=0)
@@ -141,14 +142,14 @@ def choose(
         total = total + pool[place]
         progress(0.5 * len(chosen) / count)
     best = float(objective(total))
-    for sweep in range(sweeps):
+    for sweep in range(0 if keep else _SWEEPS):
         before = best
-        for place in range(len(keep), len(chosen)):
+        for place in range(len(chosen)):
             without = total - pool[chosen[place]]
             swap, score = _best_addition(pool, without, chosen, objective)
             if score < best - 1e-9:
                 total, best, chosen[place] = without + pool[swap], score, swap
-        progress(0.5 + 0.5 * (sweep + 1) / sweeps)
+        progress(0.5 + 0.5 * (sweep + 1) / _SWEEPS)
         if before - best < 1e-3:
             break
     return chosen

@@ -210,7 +210,6 @@ def _choose_and_order(
             objective,
             rng,
             keep=kept,
-            sweeps=0 if kept else 6,
             progress=lambda done: progress("choosing", 0.3 + 0.5 * done),
         )
         progress("ordering", 0.85)

@@ -20,13 +20,12 @@ DT = 0.008
 positive = st.floats(0.01, 10.0)
 
 
-def run(arm: SimulatedArm, seconds: float, scale: float = 1.0) -> None:
-    for _ in range(round(seconds / DT)):
-        arm.step(DT, scale)
-
-
-def go(arm: SimulatedArm, goal: Vector, speed: float = 1.0, acceleration: float = 2.0) -> None:
-    arm.start(goal, speed, acceleration)
+def misses_until_rest(arm: SimulatedArm) -> list[float]:
+    seen = [arm.miss[0]]
+    while arm.moving:
+        arm.step(DT, 1.0)
+        seen.append(arm.miss[0])
+    return seen
 
 
 @given(length=positive, speed=positive, acceleration=positive, share=st.floats(0, 1))
@@ -52,19 +51,14 @@ def test_every_stop_misses_differently_and_never_jumps() -> None:
 
     arm = SimulatedArm(UR10, HOME, draw)
     assert arm.miss[0] == 1.0
-    go(arm, (0.5, *HOME[1:]))
-    seen = [arm.miss[0]]
-    while arm.moving:
-        arm.step(DT, 1.0)
-        seen.append(arm.miss[0])
+    arm.start((0.5, *HOME[1:]), 1.0, 2.0)
+    seen = misses_until_rest(arm)
     assert seen[-1] == 2.0 and max(b - a for a, b in pairwise(seen)) < 0.05
-    go(arm, (2.5, *HOME[1:]))
-    run(arm, 0.5)
-    arm.brake(2.0)
-    seen = [arm.miss[0]]
-    while arm.moving:
+    arm.start((2.5, *HOME[1:]), 1.0, 2.0)
+    for _ in range(62):
         arm.step(DT, 1.0)
-        seen.append(arm.miss[0])
+    arm.brake(2.0)
+    seen = misses_until_rest(arm)
     assert all(0 <= b - a < 0.05 for a, b in pairwise(seen))
     assert arm.miss[0] == 3.0  # a stop on the way is a stop: fully drawn anew
 

@@ -130,7 +130,7 @@ class NewCell(LivePageApp[Ending]):
                 if self.setup.camera is not None:
                     await self._look()
                 self._camera_problem = ""
-            except StationError as problem:
+            except (CodedError, OSError) as problem:
                 self._camera_problem = str(problem)
                 if self.live_page is not None:
                     self.live_page.publish(self._news | {"old": True})
@@ -209,8 +209,8 @@ class NewCell(LivePageApp[Ending]):
             self.step = STEPS[at]
 
     def action_other_mount(self) -> None:
-        self.setup.change_mount()
-        self.watch_step()
+        with self._problems():
+            self.setup.change_mount()
 
     def on_input_submitted(self) -> None:
         self.action_accept()
@@ -239,7 +239,8 @@ class NewCell(LivePageApp[Ending]):
         self.open_live_page()
 
     def action_drop(self) -> None:
-        self.setup.change(views=self.setup.draft.views[:-1])
+        with self._problems():
+            self.setup.change(views=self.setup.draft.views[:-1])
 
     def action_table_here(self) -> None:
         with self._problems():
@@ -255,8 +256,6 @@ class NewCell(LivePageApp[Ending]):
         self._say("#title", page.title)
         for part in ("#typed", "#choice", "#drawings", "#picture", "#text"):
             self.query_one(part).display = part in page.parts
-        for mount in DRAWINGS:
-            self.query_one(f"#{mount}").set_class(mount == setup.mount, "chosen")
         line = self.query_one("#typed", Input)
         line.value, line.placeholder = typed(setup, self.step), page.placeholder
         if line.display:
@@ -291,6 +290,8 @@ class NewCell(LivePageApp[Ending]):
         self._say("#next", next_line(action, width))
         self._say("#about", about(setup, self.step))
         self._say("#live-lines", live_lines(setup, self.step))
+        for mount in DRAWINGS:
+            self.query_one(f"#{mount}").set_class(mount == setup.mount, "chosen")
         warning = "" if setup.draft.found is None else setup.draft.found.warning
         self._say("#problem", problem := self._camera_problem or self._problem or warning)
         self.query_one("#problem").display = bool(problem)

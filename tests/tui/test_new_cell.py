@@ -219,6 +219,19 @@ async def test_the_wizard_says_what_it_waits_for_and_then_why_it_did_not_come(tm
         await until(pilot, lambda: "Wait" not in str(app.query_one("#next", Static).render()))
 
 
+@pytest.mark.parametrize(("step", "key"), [(CellStep.MOUNTING, "right"), (CellStep.VIEWS, "backspace")])
+async def test_a_disk_that_keeps_no_draft_is_told_and_the_wizard_goes_on(
+    tmp_path: Path, step: CellStep, key: str
+) -> None:
+    no_folder = tmp_path / "file"
+    no_folder.touch()
+    app = NewCell(GreyCamera(), no_folder, tmp_path / "station.yaml")
+    async with app.run_test(size=(80, 24)) as pilot:
+        app.step = step
+        await pilot.press(key)
+        await until(pilot, lambda: str(no_folder) in str(app.query_one("#problem", Static).render()))
+
+
 async def test_stop_takes_a_new_connection_where_the_old_one_is_refused_or_dead() -> None:
     with start_controller("UR10e", options=("--local",)) as controller, controller.admin() as admin:
         arm = await RealHardware().arm(controller.host)

@@ -109,7 +109,8 @@ install-files:  # the part of install that needs no network
 		install -D -m 644 systemd/station.env $(DESTDIR)$(SYSCONFDIR)/station/station.env
 	for folder in . operator integrator contributor reference decisions; do \
 		install -d $(DESTDIR)$(DOC)/$$folder && install -m 644 docs/$$folder/*.md $(DESTDIR)$(DOC)/$$folder; done
-	install -d $(DESTDIR)$(DOC)/schemas && install -m 644 docs/schemas/*.json $(DESTDIR)$(DOC)/schemas
+	for files in schemas/*.json examples/*.* pictures/*.png pictures/*.svg; do \
+		folder=$(DESTDIR)$(DOC)/$${files%/*}; install -d $$folder && install -m 644 docs/$$files $$folder; done
 
 uninstall:  ## stop the services and remove what install put there; configuration and data stay
 	$(if $(DESTDIR),,-systemctl disable --now station.service 2>/dev/null)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from calibrate.errors import UsageError
+from calibrate.files.folders import VERSION_NAME
 from calibrate.recorded_views import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
 from recordings.cli.console import OpenReport as OpenReport
@@ -29,7 +30,7 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
     """Raise UsageError, before the work, where no file can be written or another thing would be lost.
 
     A calibration replaces a calibration only, a report a report only; an export replaces neither a
-    recording nor a calibration.
+    recording nor a calibration. Nothing replaces what is or was installed, which `current` links to.
     """
     try:
         if not target.parent.is_dir():
@@ -43,7 +44,8 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
         raise UsageError(path=target, why=problem.strerror, advice="Name another place.") from None
     replaced = {"calibration": b"format: handeye-calibration/", "report": b"<!doctype html>"}
     others = start.startswith((MAGIC, replaced["calibration"]))
-    if others if kind == "export" else not start.startswith(replaced[kind]):
+    wrong = others if kind == "export" else not start.startswith(replaced[kind])
+    if wrong or VERSION_NAME.fullmatch(target.resolve().name):
         raise UsageError("target-exists", path=target, by=f"this {kind}")
 
 

@@ -17,7 +17,7 @@ import hashlib
 import os
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -237,8 +237,9 @@ def _take(descriptor: int, folder: Path) -> None:
                 holder = plain_text(os.pread(descriptor, 200, 0).decode(errors="replace"))
                 raise InstallError("install-busy", folder=folder, holder=holder or "a process") from None
             time.sleep(_LOCK_PAUSE_S)
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, f"process {os.getpid()} of {who()}".encode(), 0)
+    with suppress(OSError):  # a full disk, on which a withdrawal may still find room
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()} of {who()}".encode(), 0)
 
 
 def who() -> str:

@@ -15,6 +15,7 @@ import yaml
 from calibrate.cli.inputs import read_camera
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration
+from calibrate.files.install import install
 from recordings.errors import UnfinishedRecordingError
 from recordings.exporters.export import export_recording
 from recordings.importers.folder import import_folder
@@ -174,8 +175,11 @@ def test_what_an_arm_or_a_solve_was_needed_for_is_never_written_over(
     os.mkfifo(tmp_path / "pipe")
     for command in (("export", calibration, "--to", "opencv"), ("solve", recording)):
         refused(run(*command, "-o", "pipe", cwd=tmp_path), 2, "output", "pipe")
+    version = install(calibration, tmp_path / "s").path
+    for name in ("s/calibrations/current", version):
+        refused(run("solve", recording, "-o", name, cwd=tmp_path), 2, "target-exists", name)
     assert recording.read_bytes() == session_file.read_bytes()
-    assert calibration.read_bytes() == real_file.read_bytes()
+    assert calibration.read_bytes() == version.read_bytes() == real_file.read_bytes()
     assert (tmp_path / "pipe").is_fifo() and (tmp_path / "notes.txt").read_text() == "mine"
     assert not (tmp_path / "new.yaml").exists()
 

@@ -16,10 +16,10 @@ import msgspec
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.document import solver_software
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import encode_calibration, write_output
+from calibrate.files.calibration import FramePose, Sigma, encode_calibration, write_output
 from calibrate.files.integrity import content_sha256
 from calibrate.files.lines import append_line, read_lines
-from calibrate.job import JobOptions, SolvedRecording, solve_recording
+from calibrate.job import JobOptions, solve_recording
 from calibrate.resource_limits import Limits, bounded
 from recordings.errors import RecordingError
 from recordings.plain_text import plain_text
@@ -40,13 +40,8 @@ class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
     passed: bool = False
     error: str = ""
     session: str = ""
-    translation_m: tuple[float, ...] = ()
-    rotation_xyzw: tuple[float, ...] = ()
-    sigma_mm: float | None = None
-    sigma_deg: float | None = None
-    rms_px: float | None = None
-    views: int = 0
-    rejected: int = 0
+    result: FramePose | None = None
+    sigma: Sigma | None = None
     failed_gates: tuple[str, ...] = ()
     calibration: str = ""
     """File name in the output folder."""
@@ -132,27 +127,17 @@ def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tup
         error = f"internal error: {type(problem).__name__}: {problem}"
         return BatchResult(recording, key, False, error=error), b""
     name = plain_text(Path(recording).stem)[:50]  # with all else short enough for every file system
-    return _result(recording, key, job, f"{name}-{key[:8]}.calibration.yaml"), content
-
-
-def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchResult:
-    calibration = job.calibration
-    quality = calibration.quality
-    plain = msgspec.json.decode(msgspec.json.encode(calibration))
-    return BatchResult(
+    made = job.calibration
+    result = BatchResult(
         recording=recording,
         key=key,
         solved=True,
         passed=job.passed,
-        session=calibration.provenance.session,
-        translation_m=calibration.result.translation_m,
-        rotation_xyzw=calibration.result.rotation_xyzw,
-        sigma_mm=calibration.sigma.translation_mm,
-        sigma_deg=calibration.sigma.rotation_deg,
-        rms_px=quality.rms_px,
-        views=len(calibration.views.used),
-        rejected=len(calibration.views.rejected),
-        failed_gates=tuple(gate.name for gate in quality.failed),
-        calibration=name,
-        content_sha256=content_sha256(plain),
+        session=made.provenance.session,
+        result=made.result,
+        sigma=made.sigma,
+        failed_gates=tuple(gate.name for gate in made.quality.failed),
+        calibration=f"{name}-{key[:8]}.calibration.yaml",
+        content_sha256=content_sha256(msgspec.to_builtins(made)),
     )
+    return result, content

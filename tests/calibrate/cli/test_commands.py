@@ -286,7 +286,7 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(small_session_file: Path
     assert done.returncode == 3, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert [row["solved"] for row in rows] == [True, True, False]
-    assert rows[0]["translation_m"] == rows[1]["translation_m"]
+    assert rows[0]["result"] == rows[1]["result"] and rows[0]["sigma"]
     before = (tmp_path / "out/results.jsonl").read_text().splitlines()
     again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
     assert again.returncode == 0

@@ -155,6 +155,15 @@ def run(name: str, group: LazyGroup) -> None:
     try:
         try:
             group(prog_name=name)
+        except (CodedError, UnicodeEncodeError) as problem:
+            if isinstance(problem, UnicodeEncodeError):
+                problem = CodedError("not-utf-8", given=plain_text(problem.object))
+            if "--json" in sys.argv:
+                print(
+                    msgspec.json.encode(plain_data(msgspec.to_builtins(ErrorReport(problem.data)))).decode()
+                )
+            print(f"{name}: {printed(problem)}", file=sys.stderr)
+            sys.exit(problem.exit_code)
         finally:
             sys.stdout.flush()  # not at the very end of Python, which has another exit code
     except ModuleNotFoundError as missing:
@@ -164,13 +173,6 @@ def run(name: str, group: LazyGroup) -> None:
         extra = f"pip install 'calibration-station[{_EXTRAS[package]}]'"
         print(f"{name}: this command needs the package {package}: {extra}", file=sys.stderr)
         sys.exit(2)
-    except (CodedError, UnicodeEncodeError) as problem:
-        if isinstance(problem, UnicodeEncodeError):
-            problem = CodedError("not-utf-8", given=plain_text(problem.object))
-        if "--json" in sys.argv:
-            print(msgspec.json.encode(plain_data(msgspec.to_builtins(ErrorReport(problem.data)))).decode())
-        print(f"{name}: {printed(problem)}", file=sys.stderr)
-        sys.exit(problem.exit_code)
     except OSError as problem:  # a folder that may not be written, a full disk behind stdout
         where = problem.filename or "the output"
         if not isinstance(problem, BrokenPipeError):  # `| head` has read enough

@@ -23,7 +23,6 @@ RECORD_HEAD = struct.Struct("<BQ")
 """Opcode, length of the content."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence, log time, publish time; the data follow."""
-FOOTER_BYTES = RECORD_HEAD.size + 20
 RECORD_LIMIT_BYTES = 40 * 1024 * 1024
 """Packed or unpacked: the largest image of a recording and a little more."""
 _ZSTD_WINDOW_LIMIT_BYTES = 64 * 1024 * 1024

@@ -16,11 +16,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
-from mcap.records import Footer, Header, Message, MessageIndex, Metadata
+from mcap.records import Header, Message, MessageIndex, Metadata
 
 from recordings.mcap.contents import Contents
 from recordings.mcap.records import (
-    FOOTER_BYTES,
     MAGIC,
     MESSAGE_HEAD,
     RECORD_HEAD,
@@ -47,6 +46,8 @@ _PATTERN_BYTES = 49
 _BLOCK_BYTES = 64 * 1024
 _DATA_END_BYTES = 4
 _SUMMARY_LIMIT_BYTES = 32 * 1024 * 1024
+_SEAL_BYTES = 4 + len(MAGIC)
+"""End of a file: the checksum of its summary, and the mark."""
 
 
 @dataclass
@@ -107,13 +108,13 @@ class Salvage:
 def salvage(descriptor: int) -> Salvage:
     """Reads the whole open file; memory is bounded as in the strict reader."""
     found, size = Salvage(descriptor), os.fstat(descriptor).st_size
-    _declare_by_summary(found, size)
     position = len(MAGIC) if os.pread(descriptor, len(MAGIC), 0) == MAGIC else 0
     lost_from, why = -1, ""
     while position < size:
         try:
             opcode, content = _record(descriptor, position, size)
             if opcode == Opcode.DATA_END and len(content) == _DATA_END_BYTES:
+                _declare_by_summary(found, position + RECORD_HEAD.size + _DATA_END_BYTES)
                 break
             found.take(position + RECORD_HEAD.size, opcode, content)
         except BadRecordError as error:
@@ -156,16 +157,10 @@ def _next_candidate(descriptor: int, position: int, size: int) -> int:
     return size
 
 
-def _declare_by_summary(found: Salvage, size: int) -> None:
+def _declare_by_summary(found: Salvage, start: int) -> None:
     """A finished file repeats its channels at the end: they help when the chunk that had them is lost."""
-    end = size - FOOTER_BYTES - len(MAGIC)
-    tail = os.pread(found.descriptor, FOOTER_BYTES + len(MAGIC), max(0, end))
-    if end < 0 or not tail.endswith(MAGIC):
-        return
-    footer = parse(Footer, tail[RECORD_HEAD.size : FOOTER_BYTES])
-    if not 0 < footer.summary_start <= end or end - footer.summary_start > _SUMMARY_LIMIT_BYTES:
-        return
-    summary = os.pread(found.descriptor, end - footer.summary_start, footer.summary_start)
-    if zlib.crc32(tail[: FOOTER_BYTES - 4], zlib.crc32(summary)) == footer.summary_crc:
-        with suppress(BadRecordError):
-            found.declare(summary)
+    summary = os.pread(found.descriptor, _SUMMARY_LIMIT_BYTES, start)
+    checked, crc, end = summary[:-_SEAL_BYTES], summary[-_SEAL_BYTES : -len(MAGIC)], summary[-len(MAGIC) :]
+    if end == MAGIC and int.from_bytes(crc, "little") == zlib.crc32(checked):
+        with suppress(BadRecordError):  # the last record, the footer, lacks its checksum here
+            found.declare(checked)

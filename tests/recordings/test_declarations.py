@@ -126,3 +126,13 @@ def test_every_declaration_of_an_unsealed_file_may_be_lost(tmp_path: Path) -> No
     assert again.views() == whole.views()[1:]
     assert list(again.robot_states()) == list(whole.robot_states())[3:]
     assert list(again.events()) == list(whole.events())[1:]
+
+
+def test_declarations_are_found_at_the_end_of_a_file_that_lacks_a_block(tmp_path: Path) -> None:
+    """A block with the first view and what names its channel; all behind it lies elsewhere than it says."""
+    path = write_small(tmp_path / "a.mcap", poses=6)
+    (_, _, _), (first, _, _), (second, end, _), *_ = chunks_of_poses(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: first + 500] + data[(second + end) // 2 :])
+    recover_recording(path)
+    assert [view.index for view in open_recording(path).views()] == [2, 3, 4, 5]

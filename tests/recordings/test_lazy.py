@@ -41,6 +41,12 @@ def test_a_missing_extra_is_named_in_one_line() -> None:
     assert "calibration-station[station]" in done.stderr and len(done.stderr.splitlines()) == 1
 
 
+def test_an_error_that_nobody_reads_is_one_line(tmp_path: Path) -> None:
+    line = f'"{sys.executable}" -u -m recordings.cli info none --json | true'
+    done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True)
+    assert len(done.stderr.splitlines()) <= 1, done.stderr
+
+
 @pytest.mark.parametrize(
     "words", ["recordings info FILE", "recordings info FILE --json", "calibrate board -o x.png"]
 )

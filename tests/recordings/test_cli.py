@@ -124,11 +124,11 @@ def test_recover_ends_with_3_when_it_had_to_rebuild_and_with_0_when_not(tmp_path
     assert run("info", path).returncode == 0
 
 
-def test_a_missing_part_is_shown_by_info_and_given_up_by_recover(tmp_path: Path) -> None:
+def test_a_missing_part_is_shown_by_info_given_up_by_recover_and_read_when_found(tmp_path: Path) -> None:
     for part in (1, 2):
         write_small(tmp_path / f"session-{part}.mcap", info=make_info(part=part))
         enter_part(tmp_path, "test-cell", part, f"session-{part}.mcap")
-    (tmp_path / "session-2.mcap").unlink()
+    kept = (tmp_path / "session-2.mcap").rename(tmp_path / "found later")
     shown = run("info", tmp_path)
     assert shown.returncode == 3 and "session-2.mcap" in "".join(shown.stdout.split())
     assert len(json.loads(run("info", tmp_path, "--json").stdout)["missing"]) == 1
@@ -138,6 +138,8 @@ def test_a_missing_part_is_shown_by_info_and_given_up_by_recover(tmp_path: Path)
         assert not list(tmp_path.glob("*.damaged"))
     afterwards = json.loads(run("info", tmp_path, "--json").stdout)
     assert (len(afterwards["missing"]), len(afterwards["losses"])) == (0, 1)
+    kept.rename(tmp_path / "session-2.mcap")
+    assert open_recording(tmp_path).losses == ()
 
 
 def test_the_time_between_two_parts_is_no_gap(tmp_path: Path) -> None:

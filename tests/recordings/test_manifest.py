@@ -55,19 +55,6 @@ def test_one_file_of_several_is_not_the_session_and_none_is_none(session: Path) 
         open_recording(session)
 
 
-def test_recover_gives_a_missing_part_up_and_every_reader_says_so(session: Path, tmp_path: Path) -> None:
-    kept = (session / "session-3.mcap").rename(tmp_path / "found-later.mcap")
-    *whole, lost = recover_recording(session)
-    assert not any(result.missing or result.rebuilt for result in whole)
-    assert lost.missing
-    assert lost.path.name == "session-3.mcap"
-    recording = open_recording(session)
-    assert len(recording.losses) == 1
-    kept.rename(session / "session-3.mcap")
-    assert open_recording(session).losses == ()
-    assert len(open_recording(session).segments) == 3
-
-
 def test_recover_makes_the_list_where_there_was_none(tmp_path: Path) -> None:
     write_small(tmp_path / "session-2.mcap", info=make_info(part=2))
     assert [result.missing for result in recover_recording(tmp_path)] == [False, True]
@@ -113,6 +100,8 @@ def test_the_list_of_another_session_does_not_speak_for_a_file_beside_it(session
     assert open_recording(path).missing == ()
     with refused("several-sessions"):
         open_recording(session)
+    with refused("other-session"):
+        enter_part(session, "another", 1, path.name)
 
 
 @pytest.mark.parametrize(
@@ -142,11 +131,6 @@ def test_a_list_that_is_no_file_does_not_hang_its_reader(session: Path) -> None:
     os.mkfifo(session / MANIFEST_FILE)
     with refused("no-file"):
         open_recording(session)
-
-
-def test_a_folder_belongs_to_one_session(session: Path) -> None:
-    with refused("other-session"):
-        enter_part(session, "another", 1, "session.mcap")
 
 
 def test_a_part_number_is_bounded(tmp_path: Path) -> None:

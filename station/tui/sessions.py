@@ -69,6 +69,8 @@ class SessionsScreen(StationScreen):
                 self.notify("This recording was never finished: press c to recover it first.")
             case "solve":
                 await solve_session(link, session.recording, session.folder)
+            case "show" if kept.check is not None:
+                self.notify("A drift check has no result of its own: 4 shows what it judged.")
             case "show" if not session.calibration:
                 self.notify("Not solved yet: F9 solves it.")
             case "show":

@@ -29,7 +29,8 @@ async def start_drift_check(
 
     `plan`: of the poses to capture, so that its hash is known before; None: `poses` new ones.
 
-    The loaded plan, or none, stands again where nothing was started; the question names one never run.
+    The loaded plan, or none, stands again where nothing was started, but no earlier drift check's: it would
+    be offered as a capture. The question names one never run.
     Raises CalibrationError before anything is planned when nothing is installed below the daemon's root.
     """
     installed_calibration(link.root, link.camera)
@@ -47,6 +48,7 @@ async def start_drift_check(
         started = await prepared_motion(link, Prepare(Purpose.DRIFT_CHECK), approve, warnings=warnings)
     finally:
         if made is not None and not started:
+            before = None if status.session.check else before
             await link.call(LoadPlan(before or msgspec.structs.replace(made, poses=())))
     return started
 

@@ -82,6 +82,12 @@ async def test_it_is_loaded_again_where_nothing_was_started(
     assert link.asked[-1] == verbs.LoadPlan(LOADED)
 
 
+async def test_the_poses_of_an_earlier_drift_check_are_not_offered_as_a_capture() -> None:
+    link = FakeLink()
+    assert not await start_drift_check(link, during("check", "r.mcap"), AsyncMock(return_value=False))
+    assert link.asked[-1] == verbs.LoadPlan(msgspec.structs.replace(LOADED, poses=()))
+
+
 async def test_a_plan_whose_hash_was_approved_before_is_captured_as_it_is() -> None:
     link, plan = FakeLink(), msgspec.structs.replace(LOADED, note="for the night")
     assert await start_drift_check(link, loaded(), AsyncMock(return_value=True), plan=plan)

@@ -14,13 +14,14 @@ from textual.content import Content
 from textual.markup import escape
 from textual.reactive import reactive
 from textual.screen import ModalScreen, Screen
+from textual.style import Style
 from textual.widgets import Footer, Static
 
 from station.cell.status import StationStatus
 from station.protocol import verbs
 from station.protocol.states import LATCHED
 from station.protocol.verbs import Verb
-from station.tui.task import Action, Known, Step, next_action, steps
+from station.tui.task import DIGITS, Action, Known, Step, next_action, steps
 from station.tui.words import MARKS, dim, duration, shortened, state_of
 
 R = TypeVar("R")
@@ -181,8 +182,12 @@ def _step_name(step: Step, mode: str, text: str) -> Content:
     style = _BACK.get(step.mark, MARKS[step.mark][1])
     bold = "bold " if step.mark != "todo" or step.mode == mode else ""
     name = Content.styled(text, f"{bold}{style}")
-    at = text.find(step.mode.title())
-    return name.stylize("underline", at, at + len(step.mode)) if step.mode == mode else name
+    if step.mode == mode:
+        at = text.find(step.mode.title())
+        return name.stylize("underline", at, at + len(step.mode))
+    if mode in DIGITS:  # a question is answered first
+        name = name.stylize(Style.from_meta({"@click": f"app.switch_mode('{step.mode}')"}))
+    return name
 
 
 def next_line(action: Action, width: int) -> Content:
@@ -239,9 +244,11 @@ class Framed(Screen[R]):
     HORIZONTAL_BREAKPOINTS, VERTICAL_BREAKPOINTS = BREAKPOINTS
 
     def frame(self) -> Frame:
+        rail = Line(lambda known, width: rail_line(steps(known), self.MODE, width), id="rail")
+        rail.auto_links = False  # a click opens a step, which keeps its own colours
         return Frame(
             Line(lambda known, width: bar_line(known, self.NAME or self.MODE.title(), width), id="bar"),
-            Line(lambda known, width: rail_line(steps(known), self.MODE, width), id="rail"),
+            rail,
             Line(self._next, id="next"),
         )
 

@@ -169,6 +169,8 @@ async def test_stop_stands_whole_on_every_screen_and_question(
             drawn = pilot.app.screen._compositor.render_strips()
             assert any("SIMULATED" in strip.text for strip in drawn)
             assert str(pilot.app.screen.query_one("#bar").render()).split()[0].lower() in DIGITS
+        await pilot.click("#rail", offset=(2, 0))
+        await until(pilot, lambda: pilot.app.current_mode == "connect")
         for window in WINDOWS:
             pilot.app.push_screen(window())
             await until(pilot, lambda: whole(pilot.app.screen))

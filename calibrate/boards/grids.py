@@ -51,15 +51,16 @@ def find_chessboard(
     after which the board looks the same. `thorough=False` makes one quick attempt on a smaller image,
     `exhaustive=False` leaves out the attempts that take longer than all others.
     """
-    for found in _attempts(grey, (spec.columns, spec.rows), thorough, exhaustive):
+    for found, by_sectors in _attempts(grey, (spec.columns, spec.rows), thorough, exhaustive):
         if found is None:
             continue
         grid = right_handed(found.reshape(spec.rows, spec.columns, 2).astype(float))
         spacing = local_spacing(grid)
         if spacing.min() < 3.0:
             continue
-        flat = refine(grey, grid.reshape(-1, 2), spacing.ravel())
-        grid = flat.reshape(grid.shape)
+        refined = refine(grey, grid.reshape(-1, 2), spacing.ravel()).reshape(grid.shape)
+        if is_regular(refined) or not by_sectors:
+            grid = refined  # else a pattern projected onto the board pulls single corners away
         if is_regular(grid) and abs(alternation(square_greys(grey, grid))) > _ALTERNATE:
             if _goes_on(grey, grid):
                 return None
@@ -67,22 +68,25 @@ def find_chessboard(
     return None
 
 
-def _attempts(grey: Grey, size: tuple[int, int], thorough: bool, exhaustive: bool) -> Iterator[Array | None]:
+def _attempts(
+    grey: Grey, size: tuple[int, int], thorough: bool, exhaustive: bool
+) -> Iterator[tuple[Array | None, bool]]:
+    """(corners, whether `_sector` found them: to a part of a pixel, also where the squares are speckled)"""
     largest = max(grey.shape)
     if not thorough:
-        yield _scaled(grey, min(1.0, _PREVIEW_SIDE_PX / largest), lambda small: _classic(small, size))
+        yield _scaled(grey, min(1.0, _PREVIEW_SIDE_PX / largest), lambda small: _classic(small, size)), False
         return
     if largest > _LARGE_SIDE_PX:
-        yield _scaled(grey, 0.5, lambda small: _classic(small, size))  # a third of the time
-    yield _classic(grey, size)
-    yield _sector(grey, size, 0)
+        yield _scaled(grey, 0.5, lambda small: _classic(small, size)), False  # a third of the time
+    yield _classic(grey, size), False
+    yield _sector(grey, size, 0), True
     if not exhaustive:
         return
     equalised = equalise(grey)
-    yield _classic(equalised, size)
-    yield _sector(equalised, size, cv2.CALIB_CB_EXHAUSTIVE)
+    yield _classic(equalised, size), False
+    yield _sector(equalised, size, cv2.CALIB_CB_EXHAUSTIVE), True
     if largest <= _SMALL_SIDE_PX:
-        yield _scaled(grey, 2.0, lambda large: _classic(large, size))
+        yield _scaled(grey, 2.0, lambda large: _classic(large, size)), False
 
 
 def _classic(grey: Grey, size: tuple[int, int]) -> Array | None:

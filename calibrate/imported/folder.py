@@ -9,11 +9,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from calibrate.boards.model import describe_board
 from calibrate.imported.board import FEWEST, GUESSED_M, Key, Seen, see_board, told_boards
 from calibrate.imported.mounting import joints_of, joints_rad, mounting
 from calibrate.imported.table_readings import TableReading, decide, is_good, table_readings
 from recordings.errors import ImportSourceError
-from recordings.importers.conventions import NAMED, Convention, convention
+from recordings.importers.conventions import Convention, convention, tells_direction
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
 from recordings.importers.messages import Progress
 from recordings.importers.tables import Contents, Table, natural
@@ -95,12 +96,15 @@ def believe(
             tried += table_readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
     if not tried and (seen or not families):
         there = [f"{len(paths)} {name}" for name, paths in held.images.items()]
-        there += [f"{name}, to be unpacked first" for name in held.packed]
+        there += [f"{name}, {todo}" for name, todo in held.unread.items()]
         tables = [f"{len(table.numbers)} {table.name}" for table in held.tables]
         said = [", ".join(each[:8]) or "none" for each in (there, tables)]
         raise ImportSourceError("no-pairs", source=held.root, images=said[0], tables=said[1])
     if not tried:
-        raise ImportSourceError("no-board-found", source=held.root, images=", ".join(families))
+        shown = {"source": held.root, "images": ", ".join(families)}
+        if given.board is not None:
+            raise ImportSourceError("board-not-shown", **shown, board=describe_board(given.board))
+        raise ImportSourceError("no-board-found", **shown)
     return _believed(held, given, decide(held, tried, given.convention, given.mount))
 
 
@@ -130,10 +134,12 @@ def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
     ordered = sorted(paths, key=natural)
     if len(paths) == len(table.numbers):
         return {path: row for row, path in enumerate(ordered)}
-    if "#" not in table.name:
-        return {}
-    rows = {place[-1]: row for row, place in enumerate(table.places) if place}
     numbers = {path: int(found[-1]) for path in paths if (found := re.findall(r"\d+", path.stem))}
+    rows = {place[-1]: row for row, place in enumerate(table.places) if place}
+    if "#" not in table.name:  # some images are gone, neither the first nor the last
+        first, last = min(numbers.values(), default=0), max(numbers.values(), default=0)
+        counted = first in (0, 1) and last - first + 1 == len(table.numbers)
+        rows = {first + row: row for row in range(len(table.numbers))} if counted else {}
     shared: dict[Key, int] = {path: rows[number] for path, number in numbers.items() if number in rows}
     unique = len(rows) == len(table.numbers) and len(set(numbers.values())) == len(numbers)
     return shared if unique and len(shared) > 0.8 * max(len(rows), len(paths)) else {}
@@ -142,8 +148,7 @@ def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
 def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
     seen, pairs = best.seen, best.pairs
     joints, by_joints = joints_of(held, best) or (None, None)
-    # A maker's convention is the tool in the base; a spelt one tells the direction only if inverse.
-    as_told = given.convention in NAMED or (given.convention or "").endswith("-inverse")
+    as_told = tells_direction(given.convention)
     mount, inverted, board_inverted, why = mounting(held, given.mount, best, as_told, by_joints)
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)

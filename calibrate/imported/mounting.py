@@ -29,7 +29,7 @@ _NEARER = 3.0
 does not carry: a looser bound would leave rigs with long tools to guesses."""
 _IN_HAND = re.compile(
     r"eye_?(in|on)_?hand|hand_?(in|on)_?eye|hand_in\b|\beih\b|cam\w*2(gripper|end|ee|tool|flange|hand)"
-    r"|attached on robot|in_hand|inhand|flange2cam|hand_camera|static_camera false",
+    r"|attached_on_robot|in_hand|inhand|flange2cam|hand_camera|static_camera false",
     re.I,
 )
 _TO_HAND = re.compile(

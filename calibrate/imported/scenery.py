@@ -19,6 +19,8 @@ _VIEWS = 16
 """Most pictures that are compared."""
 _WIDTH_PX, _CELLS, _TILES = 512, (32, 24), (4, 4)
 """Pictures are reduced to this width; cells, and tiles of cells, across and down."""
+_BLACK, _AROUND = 2, np.ones((17, 17))
+"""No grey above it in any picture: nothing is shown there; so far around, px, its edge is felt."""
 _CLEAR = 1.5
 """Cells count outside the board's outline enlarged so much: it may be printed on a larger sheet."""
 _MOVED_PX, _FINE_PX, _CONTRAST = 15.0, 4.0, 4.0
@@ -38,7 +40,9 @@ def mount_by_scene(images: list[tuple[Grey, BoardView]], camera: CameraModel) ->
 
     The pictures may be smaller than the camera's, to which the views' pixels belong.
     """
-    cells = [_cells(grey, view, camera) for grey, view in images[:_VIEWS]]
+    images = images[:_VIEWS]
+    black = np.max([grey for grey, _ in images], axis=0, initial=0) <= _BLACK  # beside straightened pictures
+    cells = [_cells(grey, view, camera, black) for grey, view in images]
     told = np.zeros((2, *_TILES))
     for step in (1, 2):
         for (grey, board, middle), (other, its_board, its_middle) in zip(cells, cells[step:], strict=False):
@@ -51,14 +55,15 @@ def mount_by_scene(images: list[tuple[Grey, BoardView]], camera: CameraModel) ->
     return set() if abs(log_odds) < np.log(_ODDS) else {"eye-to-hand" if log_odds > 0 else "eye-in-hand"}
 
 
-def _cells(grey: Grey, view: BoardView, camera: CameraModel) -> tuple[Array, Array, Array]:
-    """(fine shapes of the reduced picture, 1 where the board is in it, the board's middle)"""
+def _cells(grey: Grey, view: BoardView, camera: CameraModel, black: Array) -> tuple[Array, Array, Array]:
+    """(fine shapes of the reduced picture, 1 where the board or nothing is in it, the board's middle)"""
     size = _WIDTH_PX, round(_WIDTH_PX * camera.height / camera.width)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     seen = ((view.pixels + 0.5) * _WIDTH_PX / camera.width - 0.5).astype(np.float32)
     outline = cv2.convexHull(seen)[:, 0]
     outline = seen.mean(axis=0) + _CLEAR * (outline - seen.mean(axis=0))
-    board = cv2.fillConvexPoly(np.zeros(size[::-1]), np.round(outline).astype(np.int32), 1.0)
+    hidden = cv2.dilate(cv2.resize(black.astype(float), size, interpolation=cv2.INTER_AREA), _AROUND)
+    board = cv2.fillConvexPoly(hidden, np.round(outline).astype(np.int32), 1.0)
     fine = cv2.GaussianBlur(small, (0, 0), 1) - cv2.GaussianBlur(small, (0, 0), _FINE_PX)
     return np.asarray(fine, float), np.asarray(board), np.asarray(seen.mean(axis=0))
 

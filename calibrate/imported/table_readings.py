@@ -21,7 +21,7 @@ from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates
 from calibrate.views import ViewSet
 from recordings.errors import ImportSourceError
-from recordings.importers.conventions import Convention, convention, possible
+from recordings.importers.conventions import Convention, convention, possible, tells_direction
 from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import Mount
 
@@ -163,16 +163,19 @@ def decide(
     held: Contents, readings: list[TableReading], named: str | None, mount: Mount | None
 ) -> TableReading:
     """The reading that is clearly best. What the user names is refused where another one is clearly better;
-    whose mounting and convention are told needs not agree well: the solve judges it."""
+    whose mounting, convention and square are told needs not agree well: the solve judges it."""
     ranked = sorted(readings, key=lambda r: (not is_good(r), -r.fit.log_evidence))
     mine = [reading for reading in ranked if named is None or reading.told == _AS_TOLD]
+    if mount and tells_direction(named):
+        mine = [reading for reading in mine if reading.mount == mount or reading.seen.convention]
     beaten = mine and _beats(ranked[0], mine[0])
     if beaten and is_good(ranked[0]):
         fits = replace(ranked[0].convention, inverse=mount not in (None, ranked[0].mount)).name
         raise ImportSourceError("other-convention", source=held.root, told=named, fits=fits)
     if not mine or beaten or not is_good(mine[0]):
         nearest = _nearest([*dict.fromkeys(ranked[:_EXPLAINED] + mine[:_EXPLAINED])])
-        if not mine or beaten or not (named and mount) or nearest["cause"]:
+        as_told = named and mount and mine and mine[0].seen.square_known
+        if beaten or not as_told or nearest["cause"]:
             raise ImportSourceError("no-reading", source=held.root, **nearest)
     best = mine[0]
     for other in mine[1:]:

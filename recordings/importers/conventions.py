@@ -114,6 +114,12 @@ def convention(name: str) -> Convention:
     return Convention(told[1], unit_m, *(sign in signs for sign in ("deg", "inverse", "first", "back")))
 
 
+def tells_direction(name: str | None) -> bool:
+    """Tell whether a convention so named says which way round a pose is: a maker's is the tool in the base, a
+    spelt one is known only with -inverse."""
+    return name in NAMED or (name or "").endswith("-inverse")
+
+
 def possible(numbers: Array) -> list[tuple[Convention, str]]:
     """Conventions that numbers (n, k) allow by themselves, each with its evidence; the usual ones first."""
     n, k = numbers.shape

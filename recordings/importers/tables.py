@@ -21,6 +21,10 @@ from recordings.importers.messages import Array
 from recordings.importers.trees import IMAGE, IMAGE_SUFFIXES, POSE_SIZES, read_tree
 
 _FILES_LIMIT = 5000
+_UNREAD = {
+    "to be unpacked first": (".zip", ".tar", ".tgz", ".gz", ".7z", ".rar"),
+    "to be saved as CSV first": (".xlsx", ".xls", ".ods", ".pkl", ".pickle"),
+}
 _HALVES = {
     "position": (re.compile(r"pos|position|trans\w*|tvec|t|xyz|p|location"), (3,)),
     "rotation": (re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues"), (3, 4, 9)),
@@ -87,8 +91,8 @@ class Contents:
     """Values of leaves that describe a board, by lower-case key."""
     words: str = ""
     """The folder's last names, names of files and keys: what may say how the camera is mounted."""
-    packed: list[str] = field(default_factory=list)
-    """Archives, which are not looked into."""
+    unread: dict[str, str] = field(default_factory=dict)
+    """Files that are not looked into → what is to be done first."""
     told: list[Table] | None = None
     """The robot's tables that the user names; None: none was named."""
 
@@ -116,8 +120,9 @@ def look(source: Path, poses: Path | None = None) -> Contents:
             alike = str(path.relative_to(root).parent / _pattern(path.name))
             found.images.setdefault(alike, []).append(path)
             continue
-        if path.suffix.lower() in (".zip", ".tar", ".tgz", ".gz", ".7z", ".rar"):
-            found.packed.append(path.name)
+        todo = next((todo for todo, suffixes in _UNREAD.items() if path.suffix.lower() in suffixes), "")
+        if todo:
+            found.unread[path.name] = todo
         tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
         if tree is None:
             continue
@@ -136,7 +141,7 @@ def look(source: Path, poses: Path | None = None) -> Contents:
                 told[key].append(_Row(numbers, node.image, place, file in (path, *path.parents)))
         for (named, *form), each in told.items():  # files of one row each make a table together
             rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
-    found.words = " ".join(dict.fromkeys(words))
+    found.words = " ".join(re.sub("[- ]", "_", word) for word in dict.fromkeys(words))
     for name, rotation, each in _joined(rows):
         for part, some in _two_by_two(each).items():
             table = _without_count(np.array([row.numbers for row in some]))

@@ -207,13 +207,36 @@ def test_a_folder_without_poses_or_images_says_what_is_there(
     with raises("no-pairs", tables="none"):
         believe(look(put(lambda folder, T: None)))
     (tmp_path / "packed").mkdir()
-    (tmp_path / "packed/data.zip").touch()
+    for name in ("data.zip", "poses.xlsx"):
+        (tmp_path / "packed" / name).touch()
     with raises("no-pairs") as refused:
         believe(look(tmp_path / "packed"))
-    assert "data.zip" in refused.value.values["images"]
+    assert all(name in refused.value.values["images"] for name in ("data.zip", "poses.xlsx"))
     (pointer := tmp_path / "1.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
     with raises("bad-image", image="1.png"):
         board.see_board(look(pointer), None, [pointer], lambda *_: None)
+
+
+def test_a_lost_image_is_told_by_the_numbers_of_the_others(
+    put: Callable[..., Path], images: tuple[Path, np.ndarray]
+) -> None:
+    folder = put(rotation_vectors)
+    (folder / "5.png").unlink()
+    for row in believe(look(folder)).rows:
+        np.testing.assert_allclose(row.base_from_flange, images[1][int(row.image[:-4]) - 1], atol=1e-6)
+    (folder / "12.png").unlink()
+    with raises("no-pairs"):  # they may have been counted anew
+        believe(look(folder))
+
+
+def test_a_board_that_no_image_shows_is_told_from_one_that_nobody_named(
+    images: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    other = BoardSpec(BoardKind.CHARUCO, 7, 5, 0.03, 0.022, "DICT_5X5_100")
+    shutil.copytree(images[0], tmp_path / "a")
+    rotation_vectors(tmp_path / "a", images[1])
+    with raises("board-not-shown"):
+        believe(look(tmp_path / "a"), Given(board=other))
 
 
 @pytest.mark.parametrize("unit", [1.0, 180 / np.pi])

@@ -61,3 +61,11 @@ def test_before_a_bare_wall_the_hands_own_parts_tell_nothing(
 ) -> None:
     wall = np.full((900, 1200), 128, np.uint8)
     assert not mount_by_scene(pictures(camera_moves, wall, width, height), CAMERA)
+
+
+def test_the_black_beside_a_straightened_picture_tells_nothing() -> None:
+    shown = pictures(True, np.full((900, 1200), 128, np.uint8), 1, 1)
+    edge = np.array([[0, 0], [320, 12], [640, 0], [628, 240], [640, 480], [320, 468], [0, 480], [12, 240]])
+    for image, _ in shown:
+        cv2.polylines(image, [edge], True, 0, 20)
+    assert not mount_by_scene(shown, CAMERA)

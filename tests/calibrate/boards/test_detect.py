@@ -307,3 +307,15 @@ def test_a_board_that_is_hard_to_see_is_found(
         assert found.corners >= share * found.expected
         truth = project_at(CAMERA, seen, board_points(spec)[found.indices])
         assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < rms_px
+
+
+def test_a_board_under_a_projected_pattern_of_dots_is_found() -> None:
+    """As depth cameras throw it."""
+    spec, rng = BoardSpec(BoardKind.CHESSBOARD, 11, 8, 0.02), np.random.default_rng(1)
+    seen = looking(spec, rng, (0.2, 0.6), 0.5)
+    dots = cv2.GaussianBlur(rng.standard_normal((CAMERA.height, CAMERA.width)), (0, 0), 0.6)
+    image = render(CAMERA, spec, seen, Light(), rng) * np.exp(0.5 * dots / dots.std() - 0.3)
+    found = detect(image.clip(0, 255).astype(np.uint8), spec)
+    assert found.corners == found.expected
+    miss = found.pixels - project_at(CAMERA, seen, board_points(spec))
+    assert np.sqrt(np.square(miss).sum(axis=1).mean()) < 0.6

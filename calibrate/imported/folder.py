@@ -101,10 +101,8 @@ def believe(
         said = [", ".join(each[:8]) or "none" for each in (there, tables)]
         raise ImportSourceError("no-pairs", source=held.root, images=said[0], tables=said[1])
     if not tried:
-        shown = {"source": held.root, "images": ", ".join(families)}
-        if given.board is not None:
-            raise ImportSourceError("board-not-shown", **shown, board=describe_board(given.board))
-        raise ImportSourceError("no-board-found", **shown)
+        sought = "board" if given.board is None else describe_board(given.board)
+        raise ImportSourceError("no-board-found", source=held.root, board=sought, images=", ".join(families))
     return _believed(held, given, decide(held, tried, given.convention, given.mount))
 
 

@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.boards.model import board_from_turned
-from calibrate.geometry import Array, inverse, rotation_angle, rotation_log, transform_points
+from calibrate.geometry import Array, inverse, rotation_angle, rotation_log
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.pose_fit import FREE, PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.readings import clear_gain, explain_recording, explain_text
 from calibrate.handeye.solution import Reading
 from calibrate.imported.board import FEWEST, Key, Seen
-from calibrate.lens.pnp import choose_candidates
+from calibrate.lens.pnp import choose_candidates, with_poses
 from calibrate.views import ViewSet
 from recordings.errors import ImportSourceError
 from recordings.importers.conventions import Convention, convention, possible, tells_direction
@@ -117,20 +116,9 @@ def _moves(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> float:
 def _fitted(
     seen: Seen, keys: list[Key], flange: Array, mount: Mount
 ) -> tuple[ViewSet, PoseFit, float, float] | None:
-    options = [seen.candidates[key] for key in keys]
-    chosen = choose_candidates(
-        [np.array([c.camera_from_board for c in each]) for each in options], flange, mount
-    )
-    views = []
-    for key, each, k, F in zip(keys, options, chosen, flange, strict=True):
-        view, found = seen.views[key], each[k]
-        points = view.board_points
-        if found.turn:
-            points = transform_points(inverse(board_from_turned(seen.board, found.turn)), points)
-        views.append(
-            replace(view, base_from_flange=F, board_points=points, camera_from_board=found.camera_from_board)
-        )
-    viewed = ViewSet(mount, tuple(views), seen.camera)
+    views = tuple(replace(seen.views[key], base_from_flange=F) for key, F in zip(keys, flange, strict=True))
+    candidates = [seen.candidates[key] for key in keys]
+    viewed = with_poses(ViewSet(mount, views, seen.camera), candidates, seen.board)
     poses = _pose_views(viewed, seen)
     try:
         fit = fit_poses(poses)

@@ -38,7 +38,11 @@ def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
     given) and, for a small board far away, towards which side it is tilted. All views together decide, by
     their agreement with the robot's motion. Raises BadViewsError when a view has no pose at all.
     """
-    candidates = _candidates(views, board)
+    return with_poses(views, _candidates(views, board), board)
+
+
+def with_poses(views: ViewSet, candidates: list[list[Candidate]], board: BoardSpec | None) -> ViewSet:
+    """Keep of each view's candidates the one that agrees with the robot's motion, and relabel its points."""
     if all(len(c) == 1 for c in candidates):
         chosen = [0] * len(candidates)
     else:

@@ -38,8 +38,6 @@ class Convention:
     inverse: bool = False
     """The base in the tool is told, not the tool in the base."""
     rotation_first: bool = False
-    looks_back: bool = False
-    """The frame's z points backwards and y upwards, as OpenGL's cameras have it."""
 
     @property
     def name(self) -> str:
@@ -48,7 +46,6 @@ class Convention:
             "deg": self.degrees,
             "mm": self.unit_m == 1e-3,
             "first": self.rotation_first,
-            "back": self.looks_back,
             "inverse": self.inverse,
         }
         return "-".join([euler, *(sign for sign, holds in signs.items() if holds)])
@@ -66,8 +63,6 @@ class Convention:
                 turn, at = numbers[:, :-3], numbers[:, -3:]
             T[:, :3, :3], T[:, :3, 3] = self._rotation(turn).as_matrix(), at
         T[:, :3, 3] *= self.unit_m
-        if self.looks_back:
-            T[:, :3, 1:3] *= -1
         return np.asarray(np.linalg.inv(T) if self.inverse else T)
 
     def _rotation(self, turn: Array) -> Rotation:
@@ -97,8 +92,6 @@ NAMED = {
     "moveit": Convention("matrix"),
     "halcon-gba": Convention("XYZ", degrees=True),
     "halcon-abg": Convention("xyz", degrees=True),
-    "colmap": Convention("wxyz", inverse=True, rotation_first=True),
-    "nerf": Convention("matrix", looks_back=True),
 }
 
 
@@ -106,12 +99,12 @@ def convention(name: str) -> Convention:
     """The convention of a name. Raises ImportSourceError that lists the names."""
     if name in NAMED:
         return NAMED[name]
-    told = re.fullmatch(r"(?:euler-)?(\w+)((?:-(?:deg|rad|mm|m|first|back|inverse))*)", name)
+    told = re.fullmatch(r"(?:euler-)?(\w+)((?:-(?:deg|rad|mm|m|first|inverse))*)", name)
     if not told or told[1] not in (*_FORMS, *_SEQUENCES):
         raise ImportSourceError("no-convention", name=name, names=", ".join(NAMED))
     signs = told[2].split("-")
     unit_m = _MM if "mm" in signs else 1.0
-    return Convention(told[1], unit_m, *(sign in signs for sign in ("deg", "inverse", "first", "back")))
+    return Convention(told[1], unit_m, *(sign in signs for sign in ("deg", "inverse", "first")))
 
 
 def tells_direction(name: str | None) -> bool:

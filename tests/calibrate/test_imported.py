@@ -229,16 +229,6 @@ def test_a_lost_image_is_told_by_the_numbers_of_the_others(
         believe(look(folder))
 
 
-def test_a_board_that_no_image_shows_is_told_from_one_that_nobody_named(
-    images: tuple[Path, np.ndarray], tmp_path: Path
-) -> None:
-    other = BoardSpec(BoardKind.CHARUCO, 7, 5, 0.03, 0.022, "DICT_5X5_100")
-    shutil.copytree(images[0], tmp_path / "a")
-    rotation_vectors(tmp_path / "a", images[1])
-    with raises("board-not-shown"):
-        believe(look(tmp_path / "a"), Given(board=other))
-
-
 @pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
 @pytest.mark.parametrize("told", [lambda T: T, np.linalg.inv])
 @pytest.mark.parametrize(("arm", "mount"), [("ur", "eye-in-hand"), ("seven joints", "eye-to-hand")])

@@ -58,6 +58,7 @@ def test_what_a_static_topic_tells_holds_until_it_is_told_anew(topic: str, turne
     moved = [[frame(t, "world", "base_link", turned(t / 8)) for t in (0, 8)]]
     track = chosen(wanted=Wanted(base="world", flange="wrist_3_link"), **{topic: moved}).track
     np.testing.assert_allclose(track.at(np.array([4]))[0], turned(turned_rad + 0.04), atol=1e-12)
+    assert (track.gap_s(4) > 0) == bool(turned_rad), "only what moves needs a report near"
 
 
 @pytest.mark.parametrize("wanted", [None, Wanted(base="base_link", flange="flange")])

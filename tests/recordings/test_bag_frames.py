@@ -65,17 +65,6 @@ def test_the_nearest_report_of_every_moving_link_counts() -> None:
     assert track.gap_s(90_000_001) == np.inf
 
 
-def test_a_static_link_holds_until_it_is_told_anew() -> None:
-    """It was once taken for a moving one, with no pose near almost every image."""
-    tree = FrameTree()
-    tree.add([frame(t, "world", "base", turned(angle)) for t, angle in ((0, 0.0), (50, 1.0))], latched=True)
-    tree.add([frame(n, "base", "flange", turned(0.01 * n)) for n in range(100)])
-    track = tree.track("world", "flange")
-    np.testing.assert_allclose(track.at(np.array([40, 60])), [turned(0.4), turned(1.6)], atol=1e-12)
-    assert track.gap_s(40) == 0 and len(track.stamps_ns) == 100
-    assert tree.find("world", "flange") == ("world", "flange")
-
-
 @pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.1), (np.nan, 0.0, 0.0, 1.0)])
 def test_what_is_no_rotation_is_refused(q: tuple[float, float, float, float]) -> None:
     with pytest.raises(ImportSourceError):

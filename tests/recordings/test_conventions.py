@@ -42,13 +42,6 @@ def test_a_pose_is_read_as_its_convention_says(name: str, angles: list[float], e
     np.testing.assert_allclose(inverted @ T, np.eye(4), atol=1e-12)
 
 
-def test_cameras_of_graphics_programs_are_read_as_optical_frames() -> None:
-    (T,) = convention("nerf").poses(np.eye(4).reshape(1, 16))
-    np.testing.assert_array_equal(T, np.diag([1, -1, -1, 1]))
-    (T,) = convention("colmap").poses(np.array([[1.0, 0, 0, 0, 0.1, 0.2, 0.3]]))
-    np.testing.assert_allclose(T[:3, 3], [-0.1, -0.2, -0.3])
-
-
 def test_a_name_spells_what_it_means() -> None:
     for known in NAMED.values():
         assert convention(known.name) == known

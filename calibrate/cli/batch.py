@@ -16,7 +16,7 @@ from calibrate.batch.cluster import cluster_workers
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import pool
 from calibrate.cli.inputs import read_limits
-from calibrate.cli.output import AsJson, err, out
+from calibrate.cli.output import err, out
 from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit
 from calibrate.errors import UsageError
 from calibrate.job import JobOptions
@@ -44,7 +44,9 @@ def batch(
             "it: use tls:// outside a closed network. Certificates: Dask's own configuration"
         ),
     ] = None,
-    as_json: AsJson = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print a JSON object a recording, one a line")
+    ] = False,
 ) -> None:
     """Solve many recordings; resumable.
 

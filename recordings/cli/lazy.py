@@ -174,11 +174,12 @@ def run(name: str, group: LazyGroup) -> None:
         print(f"{name}: this command needs the package {package}: {extra}", file=sys.stderr)
         sys.exit(2)
     except OSError as problem:  # a folder that may not be written, a full disk behind stdout
-        where = problem.filename or "the output"
+        if problem.filename is None:  # stdout itself, which would fail once more with what it still holds
+            with suppress(OSError):
+                sys.stdout.close()
         if not isinstance(problem, BrokenPipeError):  # `| head` has read enough
+            where = problem.filename or "the output"
             print(plain_text(f"{name}: {where}: {problem.strerror or problem}"), file=sys.stderr)
-        with suppress(OSError):
-            sys.stdout.close()  # what it still holds would fail once more
         sys.exit(1)
 
 

@@ -110,6 +110,8 @@ DATASETS = {
     "rendered-truth-eye-to-hand": (27, 2.0, 8.0),
     "far-small-board": (24, 4.0, 8.0),
 }
+WITHOUT_BOARD = {"far-small-board": (*range(12, 30), *range(39, 44), *range(57, 63))}
+"""Rows of poses that are left out: looking long for a board that is not there is the same in the others."""
 
 
 @pytest.fixture(scope="module")
@@ -118,9 +120,16 @@ def solved_set(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Sol
 
     @cache
     def solve(folder: Path) -> SolvedRecording:
-        recording = tmp_path_factory.mktemp("set") / "r.mcap"
-        import_folder(folder, recording)
-        return solve_recording(recording)
+        place = tmp_path_factory.mktemp("set")
+        if left_out := WITHOUT_BOARD.get(folder.name):
+            (place / "images").symlink_to(folder / "images")
+            shutil.copyfile(folder / "dataset.yaml", place / "dataset.yaml")
+            head, *rows = (folder / "poses.csv").read_text().splitlines()
+            kept = [row for number, row in enumerate(rows) if number not in left_out]
+            (place / "poses.csv").write_text("\n".join([head, *kept]))
+            folder = place
+        import_folder(folder, place / "r.mcap")
+        return solve_recording(place / "r.mcap")
 
     return solve
 

@@ -14,8 +14,6 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from calibrate.boards.corners import (
     Grey,
@@ -172,6 +170,9 @@ def count_circles(grey: Grey) -> int:
 
 def _together(image: Any, largest_px: float) -> Iterator[Array]:
     """Centres (k, 2) px of dark blobs of about one size that lie together, for every size."""
+    from scipy.sparse.csgraph import connected_components  # a quarter of a second, for circles only
+    from scipy.spatial import KDTree
+
     blobs = _blobs(largest_px).detect(image)
     at, size = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
     if not blobs:

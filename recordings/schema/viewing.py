@@ -18,7 +18,6 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from recordings.images import Pixels, raw_encoding
 from recordings.schema.messages import CameraModel, CaptureEvent, Matrix4, RobotState, Vector6
@@ -172,6 +171,9 @@ def log_line(event: CaptureEvent, time_ns: int) -> Any:
 
 
 def quaternion_xyzw(transform: Matrix4) -> tuple[float, float, float, float]:
-    """Quaternion of a rigid transform, w ≥ 0."""
-    x, y, z, w = Rotation.from_matrix(np.array(transform)[:3, :3]).as_quat(canonical=True).tolist()
-    return x, y, z, w
+    """Quaternion of a rigid transform, w ≥ 0. I. Bar-Itzhack (2000); scipy's takes the daemon long to load."""
+    R = np.array(transform)[:3, :3]
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    K = np.block([[R + R.T - np.trace(R) * np.eye(3), axis[:, None]], [axis, np.trace(R)]])
+    x, y, z, w = np.linalg.eigh(K)[1][:, -1].tolist()
+    return (x, y, z, w) if w >= 0 else (-x, -y, -z, -w)

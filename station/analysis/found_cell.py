@@ -16,7 +16,6 @@ import numpy as np
 from calibrate.errors import CalibrationError
 from calibrate.geometry import difference
 from calibrate.handeye.pose_fit import FREE, fit_poses, pose_views
-from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.views import ViewSet, implied_flange
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
@@ -164,6 +163,10 @@ def odd_view(
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None
     fit = quick.fit
+    from calibrate.handeye.readings import (
+        explain_recording,
+    )  # with scipy, which the daemon itself does not need
+
     if (session := explain_recording(quick.poses)).reading in _WAYS:
         return StationError("poses-misread", views=len(seen), way=_WAYS[session.reading])
     if fit.full[-1] >= _ORDINARY or fit.full[:-1].mean() < 0.5:

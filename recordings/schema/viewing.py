@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import cv2
@@ -98,13 +97,8 @@ def frame_transform(parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
 
 def base_from_flange(tcp_pose: Vector6, tcp_offset: Vector6) -> Matrix4:
     """The controller's tool pose without the tool: base_from_tcp and flange_from_tcp → base_from_flange."""
-    T = matrix_of(tcp_pose) @ _tcp_from_flange(tcp_offset)
+    T = matrix_of(tcp_pose) @ np.linalg.inv(matrix_of(tcp_offset))
     return tuple(map(tuple, T.tolist()))
-
-
-@cache
-def _tcp_from_flange(tcp_offset: Vector6) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.inv(matrix_of(tcp_offset)), np.float64)
 
 
 def matrix_of(pose: Vector6) -> NDArray[np.float64]:

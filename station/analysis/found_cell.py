@@ -163,9 +163,7 @@ def odd_view(
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None
     fit = quick.fit
-    from calibrate.handeye.readings import (
-        explain_recording,
-    )  # with scipy, which the daemon itself does not need
+    from calibrate.handeye.readings import explain_recording  # it loads scipy, the daemon needs none
 
     if (session := explain_recording(quick.poses)).reading in _WAYS:
         return StationError("poses-misread", views=len(seen), way=_WAYS[session.reading])

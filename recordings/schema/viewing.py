@@ -165,7 +165,7 @@ def log_line(event: CaptureEvent, time_ns: int) -> Any:
 
 
 def quaternion_xyzw(transform: Matrix4) -> tuple[float, float, float, float]:
-    """Quaternion of a rigid transform, w ≥ 0. I. Bar-Itzhack (2000); scipy's takes the daemon long to load."""
+    """Quaternion of a rigid transform, w ≥ 0. I. Bar-Itzhack (2000). scipy takes long to load."""
     R = np.array(transform)[:3, :3]
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     K = np.block([[R + R.T - np.trace(R) * np.eye(3), axis[:, None]], [axis, np.trace(R)]])

@@ -27,24 +27,6 @@ def test_a_line_of_the_table_opens_its_commands_help(name: str) -> None:
     assert 0 < len(line) <= 72
 
 
-@pytest.mark.parametrize(
-    ("argument", "foreign"),
-    [
-        ("--help", ("numpy", "scipy", "cv2", "textual", "calibrate", "station.operate", "asyncio")),
-        ("status", ("numpy", "scipy", "cv2", "textual", "calibrate", "station.simulation", "station.plan")),
-        ("capture", ("textual", "gi", "serial", "rtde_control", "station.simulation", "station.session")),
-    ],
-)
-def test_a_command_loads_what_it_needs_alone(argument: str, foreign: tuple[str, ...]) -> None:
-    program = (
-        f"import sys, station.cli; sys.argv = ['station', {argument!r}, '--help']\n"
-        "try: station.cli.main()\n"
-        f"except SystemExit: print([m for m in {foreign} if m in sys.modules], file=sys.stderr)"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stderr.strip() == "[]"
-
-
 @pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
 def test_help_fits_on_a_small_terminal_and_all_lists_every_command(program: str) -> None:
     def told(option: str) -> list[str]:

@@ -183,19 +183,6 @@ def test_other_arguments_are_left_to_the_whole_command_line() -> None:
     assert main(["--help"]) is None and main(["--socket"]) is None and main(["--socket", "--help"]) is None
 
 
-def test_stop_loads_nothing_large(tmp_path: Path) -> None:
-    """0.03 s of processor time against 0.29 s; an import that creeps in shows here."""
-    program = (
-        "import sys; sys.argv = ['station', 'stop', '--socket', sys.argv[1]]\nfrom station.cli import main\n"
-        "try: main()\nexcept SystemExit: print([m for m in sys.modules if m.split('.')[0] in "
-        "('asyncio', 'typer', 'rich', 'msgspec', 'numpy', 'json', 'logging', 'subprocess')])"
-    )
-    said = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path / "c.sock")], capture_output=True, text=True
-    )
-    assert said.stdout.strip() == "[]"
-
-
 # -- whose folder it is ------------------------------------------------------------------------------------
 
 

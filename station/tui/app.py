@@ -220,7 +220,7 @@ class StationApp(LivePageApp[None], DaemonApp):
     async def action_stop(self) -> None:
         await self.link.stop()
 
-    @work(exclusive=True, group="command", exit_on_error=False)
+    @work(exclusive=True, group="run", exit_on_error=False)
     async def action_run(self) -> None:
         """Start the plan, made now where there is none, or go on with a session that is paused."""
         status = self.known.live
@@ -240,7 +240,7 @@ class StationApp(LivePageApp[None], DaemonApp):
         """Send a request that has no arguments, by its name."""
         await self.link.ask(verbs.VERBS[verb]())
 
-    @work(exclusive=True, group="command", exit_on_error=False)
+    @work(exclusive=True, group="finish", exit_on_error=False)
     async def action_finish(self) -> None:
         live, session = self.known.live, self.known.shown.session
         if live is not None and (refusal := verbs.Finish.refusal(live.state)) is not None:
@@ -267,7 +267,7 @@ class StationApp(LivePageApp[None], DaemonApp):
         if await self.link.ask(verbs.Acknowledge()) is not None:
             self.clear_notifications()  # what they said of the stop is over
 
-    @work(exclusive=True, group="command", exit_on_error=False)
+    @work(exclusive=True, group="quit", exit_on_error=False)
     async def action_quit(self) -> None:  # type: ignore[override]  # Textual awaits a worker, too
         held = self.known.works and self.link.has_control()
         if not held or await self.link.ask_person(Confirm("Close the screen?", HELD, yes="Close")):
@@ -276,12 +276,15 @@ class StationApp(LivePageApp[None], DaemonApp):
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """List every key's action by name; what moves the arm asks first from here too.
 
-        Of Textual's own only the theme: its others hide the frame, with STOP, or quit unasked.
+        Of Textual's own only the theme: its others hide the frame, with STOP, or quit unasked. A question is
+        answered first: over it only what works there by its key.
         """
         yield SystemCommand("Theme", "Dark, light, or the terminal's own colours", self.action_change_theme)
         own = screen.BINDINGS if isinstance(screen, StationScreen) else []
         for place, bindings in ((screen, own), (self, self.BINDINGS)):
             for binding in (b for b in bindings if isinstance(b, Binding) and b.tooltip):
+                if not binding.priority and not isinstance(screen, StationScreen):
+                    continue
                 yield SystemCommand(
                     f"{binding.description} ({binding.key})",
                     binding.tooltip,

@@ -42,6 +42,10 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
             await pilot.press("f5")
             await until(pilot, lambda: pilot.app.screen.query("#yes"))
         await until(pilot, lambda: pilot.app.screen.query_one("#yes").region)
+        await pilot.press("f8")  # as STOP's, it works in a question, and leaves it answerable
+        await until(pilot, lambda: "acknowledge" in link.verbs)
+        asked = {command.title for command in pilot.app.get_system_commands(pilot.app.screen)}
+        assert asked == {"Theme", "STOP (f12)", "Acknowledge (f8)"}, "others would take the question away"
         await pilot.click("#yes")
         await until(pilot, lambda: verbs.Go("t-1", SUMMARY.approval_sha256) in link.asked)
         await until(pilot, lambda: pilot.app.current_mode == "capture")  # where the work is watched

@@ -53,9 +53,7 @@ class Chain:
     @property
     def plain(self) -> LearnedArm:
         """The same as a calibration file keeps it."""
-        axes, points, flange = (
-            tuple(map(tuple, part.tolist())) for part in (self.axes, self.points, self.flange)
-        )
+        axes, points, flange = (as_rows(part) for part in (self.axes, self.points, self.flange))
         return LearnedArm(axes, points, tuple(self.posture_rad.tolist()), flange)
 
     def motions(self, joints_rad: Array) -> Array:
@@ -129,6 +127,11 @@ class Chain:
                 along = axis @ (at - point)
             at = point + along * axis
             yield at
+
+
+def as_rows(matrix: Array) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix (m, n) as a file keeps it."""
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def chain_of(model: DhTable) -> Chain:

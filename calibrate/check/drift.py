@@ -127,6 +127,8 @@ def find_shift(views: ViewSet, known: KnownCell) -> DriftCheck:
             counted=f"{len(views)} views for a drift check",
             advice="Capture more: station drift-check.",
         )
+    if not any(len(view.pixels) for view in views):  # such board poses have errors that nobody stated
+        raise BadViewsError("no-corners")
     known = known.beside(views)
     observed, prior = known.observe(views), known.prior(camera_may_have_moved=True)
     # Noise of its own brings the fit to the optimum from far; there the installed noise judges.

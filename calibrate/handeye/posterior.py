@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibrate.chain import Chain, LearnedChain, joint_readings
+from calibrate.chain import Chain, LearnedChain, as_rows, joint_readings
 from calibrate.geometry import Array, difference
 from calibrate.handeye.arm import (
     flange_extent,
@@ -43,7 +43,7 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     level = gravity_in_flange(flanges).mean(axis=0)
     extent = flange_extent(flanges[fit.plain.used])
     return Posterior(
-        X=_rows(state.X),
+        X=as_rows(state.X),
         lens=intrinsics_vector(state.camera).tolist(),
         shape=state.shape.tolist(),
         errors=state.arm_errors.tolist(),
@@ -52,19 +52,15 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
         corner_noise_px=(scales.tau_px, scales.lambda_px, scales.sigma_px),
         class_shares=scales.shares.tolist(),
         freedom=found.freedom,
-        board_extent_m=_rows(fit.observed.extent),
+        board_extent_m=as_rows(fit.observed.extent),
         arm=None if chain is None else chain.plain,
-        stated_arm_error=_rows(stated_arm_error) if stated_arm_error.any() else None,
+        stated_arm_error=as_rows(stated_arm_error) if stated_arm_error.any() else None,
         level=tuple(level.tolist()) if len(state.arm_errors) else None,
         flange_extent_m=None if smooth is None else tuple(extent.tolist()),
         without_joints=None
         if chain is None or fit.smooth is None
         else posterior_of(replace(fit, arm=None), stated_arm_error),
     )
-
-
-def _rows(matrix: Array) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in matrix.tolist())
 
 
 @dataclass(frozen=True, eq=False)

@@ -249,6 +249,9 @@ def test_too_few_or_untelling_views_are_refused() -> None:
     views = few_views(np.random.default_rng(8), installed(), np.zeros(6), 3)
     with raises("too-few-views", TooFewViewsError, views=2, needed=3):
         find_shift(views.select([0, 1]), installed())
+    with raises("no-corners", BadViewsError):
+        bare = {"pixels": lambda view: view.pixels[:0], "board_points": lambda view: view.board_points[:0]}
+        find_shift(changed(views, [0, 1, 2], **bare), installed())
     with raises("shift-open", BadViewsError):
         find_shift(replace(views, views=(views.views[0],) * 3), installed())
 

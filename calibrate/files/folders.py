@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from calibrate.errors import InstallError
-from calibrate.files.validity import FILE, Validity, parse_validity, time_text, unrecorded
+from calibrate.files.validity import FILE, Validity, parse_validity, unrecorded
 from recordings.files import LOG_LIMIT_BYTES, MAIN_CAMERA, is_session_name, read_file, state_root
 
 VERSION_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
@@ -64,8 +64,7 @@ def read_validity(folder: Path) -> dict[int, Validity]:
 def validity_of(folder: Path, number: int) -> Validity:
     """Read the validity now of version `number`, which need not be the current one."""
     try:
-        installed = datetime.fromtimestamp((folder / "current").lstat().st_mtime, UTC)
-        found = read_validity(folder).get(number) or unrecorded(number, time_text(installed))
+        found = read_validity(folder).get(number) or unrecorded(number)
     except OSError as problem:
         raise InstallError(
             "state-folder", path=problem.filename or str(folder), why=problem.strerror

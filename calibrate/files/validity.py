@@ -165,10 +165,10 @@ def parse_validity(content: bytes) -> dict[int, Validity]:
     return {entry.version: entry for line in content.splitlines() if (entry := _parse(line)) is not None}
 
 
-def unrecorded(version: int, installed: str = "") -> Validity:
-    """Make the validity of a version without a record; `installed`: time of its installation, if known."""
-    text = "Installed before validity was recorded. Run a drift check."
-    return Validity(version, ValidityState.UNVERIFIED, installed, ValidityReason("no-record", text))
+def unrecorded(version: int) -> Validity:
+    """Make the validity of a version of which the file has no whole line."""
+    text = "Its record is lost. Run a drift check."
+    return Validity(version, ValidityState.UNVERIFIED, "", ValidityReason("no-record", text))
 
 
 def _parse(line: bytes) -> Validity | None:

@@ -291,8 +291,6 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(small_session_file: Path
     again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
     assert again.returncode == 0
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
-    for option in ("--time-offset=a.yaml", "--accept-move"):
-        refused(run("solve", recordings[0], option, cwd=tmp_path), 2, "", option.partition("=")[0])
 
 
 def test_the_report_is_one_page_with_no_network(small_session_file: Path, tmp_path: Path) -> None:

@@ -237,7 +237,7 @@ def test_camera_info(calibration: Calibration, model: str, given: int, named: st
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_says_whether_the_installed_one_holds(calibration: Calibration, name: str) -> None:
-    names = FrameNames(validity=unrecorded(3, "2026-01-01T00:00:00+00:00"))
+    names = FrameNames(validity=unrecorded(3))
     assert "unverified" in export(calibration, name, names)
     for state in (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN):
         held = Validity(3, state, "2026-01-01T00:00:00+00:00", ValidityReason("watch"))

@@ -182,7 +182,7 @@ def test_what_nobody_vouches_for_is_unverified(
     assert load_installed(tmp_path / "s").validity.state is U
 
 
-def test_a_root_from_before_validity_was_recorded_is_unverified(root: Path) -> None:
+def test_what_has_lost_its_record_is_unverified(root: Path) -> None:
     (root / "calibrations/validity.jsonl").unlink()
     found = load_installed(root).validity
     assert (found.state, found.reason.code) == (U, "no-record")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import islice
 from types import UnionType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -39,6 +39,8 @@ class YamlProblem:
     """'limits.speed_m_s'"""
     text: str
     remedy: str = ""
+    harmless: bool = False
+    """The file is read all the same."""
 
     def __str__(self) -> str:
         place = f"line {self.line}: " if self.line else ""
@@ -61,12 +63,13 @@ class _Loader(yaml.CSafeLoader):  # type: ignore[misc]  # yaml has no types
 
 
 _WHOLE = r"[-+]?(0|[1-9][0-9]*)"
-"""No leading zero: a serial number 0128 is text, as it is to the YAML 1.1 that Python's programs write."""
+"""No leading zero: a serial number 0128 is text, as it is to the YAML 1.1 that Python's programs write. With
+a point it is a number: 0012.5."""
 for _tag, _pattern in (
     ("null", r"~|null|Null|NULL|"),
     ("bool", r"true|True|TRUE|false|False|FALSE"),
     ("int", _WHOLE),
-    ("float", rf"({_WHOLE}(\.[0-9]*)?|[-+]?\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan"),
+    ("float", rf"({_WHOLE}|[-+]?([0-9]+\.[0-9]*|\.[0-9]+))([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan"),
 ):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), None)
 _Loader.add_constructor(
@@ -107,15 +110,26 @@ def load_plain(content: bytes) -> Any:
         raise _no_yaml(error) from None
 
 
+@dataclass(frozen=True)
+class Loaded(Generic[T]):
+    """A file's content, and what its reader may say of it."""
+
+    value: T
+    lines: dict[str, int]
+    """'limits.speed_m_s' to its line"""
+    ignored: list[YamlProblem]
+    """Keys of earlier releases that are without effect."""
+
+
 def load(content: bytes, kind: type[T], under: str = "") -> T:
     """The file's content as `kind`; see `read`."""
-    return read(content, kind, under)[0]
+    return read(content, kind, under).value
 
 
-def read(content: bytes, kind: type[T], under: str = "") -> tuple[T, dict[str, int]]:
+def read(content: bytes, kind: type[T], under: str = "") -> Loaded[T]:
     """Read the content as `kind`, a msgspec struct. Raises StrictYamlError with all problems and lines.
 
-    The second value maps keys, as 'limits.speed_m_s', to their lines. `under`: where the file has this key,
+    A struct's `GONE` names keys of earlier releases, which are ignored. `under`: where the file has this key,
     only what stands below it is read.
     """
     import msgspec
@@ -128,10 +142,11 @@ def read(content: bytes, kind: type[T], under: str = "") -> tuple[T, dict[str, i
         node, where = _below(loader.get_single_node(), under)
         if node is None:
             raise StrictYamlError([YamlProblem(0, "", "the file is empty")])
-        if problems := list(islice(_problems(node, kind, where), _PROBLEMS_TOLD)):
-            raise StrictYamlError(problems)
+        problems = list(islice(_problems(node, kind, where), _PROBLEMS_TOLD))
+        if wrong := [problem for problem in problems if not problem.harmless]:
+            raise StrictYamlError(wrong)
         value = msgspec.convert(loader.construct_document(node), kind)
-        return value, dict(_lines(node, where))
+        return Loaded(value, dict(_lines(node, where)), problems)
     except StrictYamlError:
         raise
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, OverflowError) as error:
@@ -194,11 +209,14 @@ def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: 
     hints = get_type_hints(kind, include_extras=True)  # with the limits of numbers
     fields = {f.encode_name: f for f in fields_of(kind)}
     seen: set[str] = set()
-    for key, value in node.value:
+    for key, value in list(node.value):
         name, line = str(key.value), key.start_mark.line + 1
         inside = f"{where}.{name}" if where else name
         if name in seen:
             yield YamlProblem(line, inside, "stands here twice")
+        elif name in getattr(kind, "GONE", ()):
+            yield YamlProblem(line, inside, "has no effect any more", "Delete it.", harmless=True)
+            node.value.remove((key, value))
         elif name not in fields:
             import difflib
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
@@ -89,6 +89,13 @@ REAL_DRIVERS = ("aravis", "webcam")
 
 
 class CameraConfig(Section, frozen=True):
+    GONE: ClassVar = frozenset(
+        {
+            "playback_pace", "ptp", "time_offset", "gain", "packet_delay_us", "invert_trigger_line",
+            "exposure_line", "frame_rate_hz", "trigger_activation", "trigger_delay_us",
+        }
+    )  # fmt: skip
+
     name: Annotated[str, msgspec.Meta(pattern="^[a-z0-9-]{1,40}$")] = MAIN_CAMERA
     """Name among the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
     driver: Literal["aravis", "webcam", "playback", "rendered"] = "aravis"
@@ -112,6 +119,8 @@ class CameraConfig(Section, frozen=True):
 
 
 class TriggerConfig(Section, frozen=True):
+    GONE: ClassVar = frozenset({"mode", "light_level"})
+
     port: str
     pulse_us: Annotated[int, msgspec.Meta(gt=0)] = 1000
 
@@ -165,6 +174,7 @@ class LimitsConfig(Section, frozen=True):
 class PointerConfig(Section, frozen=True):
     """Pointer whose tip a person puts on a corner (the touch test), in `flange`."""
 
+    GONE: ClassVar = frozenset({"along", "radius_m"})
     tip_m: Place
 
 
@@ -180,6 +190,7 @@ class StillnessConfig(Section, frozen=True):
 
 
 class CaptureConfig(Section, frozen=True):
+    GONE: ClassVar = frozenset({"lossless_png", "retries"})
     time_bound_s: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.02
     """Largest bound of the image time for which a pose is accepted. At the stillness limit of 2 mrad/s it is
     0.04 mm at one metre."""

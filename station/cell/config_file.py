@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,8 @@ from recordings.strict_yaml import StrictYamlError, YamlProblem
 from station.cell.config import REAL_DRIVERS, CameraConfig, PoseGuess, RobotConfig, StationConfig
 from station.cell.errors import ConfigError
 from station.cell.layout import arm_model
+
+log = logging.getLogger(__name__)
 
 _POSTURES_RAD = np.array([[0.0] * 6, [0.0, -1.5, 1.5, -1.5, -1.5, 1.0]])
 _MOST_CORRECTION = 0.1
@@ -37,11 +40,11 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
     """
     try:
         content = read_file(path, strict_yaml.LIMIT_BYTES)
-        config, lines = strict_yaml.read(content, StationConfig)
-        wrong = [_placed(problem, lines) for problem in _contradictions(config)]
-        if config.robot.driver == "posted" and "robot.model" not in lines:
+        loaded = strict_yaml.read(content, StationConfig)
+        wrong = [_placed(problem, loaded.lines) for problem in _contradictions(loaded.value)]
+        if loaded.value.robot.driver == "posted" and "robot.model" not in loaded.lines:
             unnamed = ("robot.model", "the posted arm has no name", "Give it one, such as 'xArm 6'.")
-            wrong.append(_placed(unnamed, lines))
+            wrong.append(_placed(unnamed, loaded.lines))
     except OSError as error:
         raise ConfigError("unreadable-config", path=path, reason=error.strerror) from None
     except StrictYamlError as error:
@@ -49,7 +52,9 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
     if wrong:
         listed = "".join(f"\n  {problem}" for problem in wrong)
         raise ConfigError("invalid-config", path=path, problems=len(wrong), listed=listed)
-    return config, content
+    for ignored in loaded.ignored:
+        log.warning("%s: %s", path, ignored)
+    return loaded.value, content
 
 
 def _placed(problem: Problem, lines: dict[str, int]) -> YamlProblem:

@@ -30,6 +30,16 @@ CENTRE_IN_MM = "[[1667, 0, 3.2], [0, 1667, -2.1], [0, 0, 1]]"
 PLACE = "translation_m: [0, 0, 0.1], rotation_xyzw: [0, 0, 0, 1]"
 
 
+def test_a_key_that_is_gone_is_told_once_and_ignored(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD + "pointer: {tip_m: [0, 0, 0.1], along: [0, 0, 1], radius_m: 0.02}\n")
+    (tmp_path / "without.yaml").write_text(GOOD + "pointer: {tip_m: [0, 0, 0.1]}\n")
+    assert load_config(path)[0] == load_config(tmp_path / "without.yaml")[0]
+    assert [record.getMessage().count("pointer.") for record in caplog.records] == [1, 1]
+
+
 def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
     with raises("unreadable-config") as caught:
         load_config(tmp_path / "station.yaml")

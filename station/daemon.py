@@ -14,7 +14,7 @@ from pathlib import Path
 
 from recordings.schema.messages import Source
 from station.cell.config import REAL_DRIVERS, StationConfig
-from station.cell.errors import ConfigError, RobotError
+from station.cell.errors import ConfigError
 from station.cell.process import RealTimeThreads, freeze_startup
 from station.cell.status import StationState
 from station.devices.base import Camera
@@ -65,8 +65,8 @@ class Daemon:
         """`told_to_end` is called when SIGTERM, SIGINT or `end` begins the shutdown."""
         self.session = Session(cell, root)
         dispatcher = SessionDispatcher(self.session)
-        self._client_server = ClientServer(control, dispatcher, newest=lambda: self.session.store.status)
-        self._stop_server = StopServer(control, dispatcher.stop_by_datagram, self._latched, self._speed_rad_s)
+        self._client_server = ClientServer(control, dispatcher)
+        self._stop_server = StopServer(control, dispatcher)
         self.session.supervisor.first = self._stop_server.round
         self.session.supervisor.ticked = self._ping
         self._watchdog_s, self._pinged_s = watchdog_period_s(), 0.0
@@ -105,16 +105,6 @@ class Daemon:
             self._ending.set()
             self._told_to_end()
 
-    def _latched(self) -> bool:
-        return self.session.store.state is StationState.STOPPED
-
-    def _speed_rad_s(self) -> float | None:
-        try:
-            speeds = self.session.context.cell.arm.latest().joint_speeds_rad_s
-        except RobotError:
-            return None
-        return max(map(abs, speeds), default=None)
-
     async def _tell(self) -> None:
         """Send changes of the status to watchers, gathered for a moment."""
         while True:
@@ -122,7 +112,7 @@ class Daemon:
                 async with asyncio.timeout(CONTROL_SERVED_S / 4):
                     await self._changed.wait()
             self._changed.clear()
-            self._client_server.publish(self.session.store.status)
+            self._client_server.publish()
             self._tell_systemd()
             self._served_s = time.monotonic()
             await asyncio.sleep(GATHER_S)

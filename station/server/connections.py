@@ -50,15 +50,12 @@ NEW_PER_S = 200
 
 
 class ClientServer:
-    """Server of the control socket until `close`; `publish` sends changes of the status to watchers."""
+    """Server of the control socket until `close`."""
 
-    def __init__(
-        self, path: Path, handler: SessionDispatcher, newest: Callable[[], StationStatus] | None = None
-    ) -> None:
-        """`newest`: returns the status for a new watcher; the last one published may be older."""
+    def __init__(self, path: Path, handler: SessionDispatcher) -> None:
         self._path, self._handler = path, handler
         self._status = StationStatus()
-        self._newest = newest or (lambda: self._status)
+        """As it was sent last."""
         self._listening: socket.socket | None = None
         self._connections: set[_Connection] = set()
         self._serving: dict[asyncio.Task[None], int] = {}
@@ -80,7 +77,9 @@ class ClientServer:
         self._listening = listening
         self._listen()
 
-    def publish(self, status: StationStatus) -> None:
+    def publish(self) -> StationStatus:
+        """Send changes of the status to every watcher; return the status."""
+        status = self._handler.status
         changes = changed_sections(self._status, status)
         self._status = status
         if changes:
@@ -92,6 +91,7 @@ class ClientServer:
                     connection.send(line)
                     if connection.peer.client_id == in_control and unread_s > UNREAD_LIMIT_S:
                         connection.abort()
+        return status
 
     async def close(self) -> None:
         if self._listening is not None:
@@ -152,17 +152,13 @@ class ClientServer:
         protocol = asyncio.StreamReaderProtocol(reader)
         transport, _ = await loop.connect_accepted_socket(lambda: protocol, link)
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
-        connection = _Connection(peer, reader, writer, self._handler, self._publish_newest)
+        connection = _Connection(peer, reader, writer, self._handler, self.publish)
         self._connections.add(connection)
         try:
             await connection.run()
         finally:
             self._connections.discard(connection)
             self._handler.gone(peer)
-
-    def _publish_newest(self) -> StationStatus:
-        self.publish(self._newest())
-        return self._status
 
 
 class _Connection:
@@ -176,7 +172,7 @@ class _Connection:
         handler: SessionDispatcher,
         publish: Callable[[], StationStatus],
     ) -> None:
-        """`publish`: sends changes of the status to every watcher; returns the newest status."""
+        """`publish`: that of the server."""
         self.peer = peer
         self.watching = False
         self._reader, self._writer, self._handler = reader, writer, handler

@@ -7,8 +7,9 @@ from collections.abc import Awaitable, Callable, Coroutine
 
 import msgspec
 
-from station.cell.errors import RefusedError
+from station.cell.errors import RefusedError, RobotError
 from station.cell.socket_folder import user_name
+from station.cell.status import StationState, StationStatus
 from station.protocol import verbs
 from station.protocol.verbs import VERBS, Verb
 from station.server.approval import ApprovalRule, Peer, Process, process
@@ -27,6 +28,24 @@ class SessionDispatcher:
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
         """User id → name, once looked up."""
+
+    @property
+    def status(self) -> StationStatus:
+        return self._session.store.status
+
+    @property
+    def latched(self) -> bool:
+        """Tell whether STOP is latched."""
+        return self.status.state is StationState.STOPPED
+
+    @property
+    def speed_rad_s(self) -> float | None:
+        """Speed of the arm's fastest joint now; None where it is not known."""
+        try:
+            speeds = self._session.context.cell.arm.latest().joint_speeds_rad_s
+        except RobotError:
+            return None
+        return max(map(abs, speeds), default=None)
 
     def stop_by_client(self, peer: Peer) -> Awaitable[object]:
         """Begin STOP at once; return an awaitable for its end."""

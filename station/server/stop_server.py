@@ -13,15 +13,18 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from station.cell.errors import StationError
 from station.cell.socket_folder import bind, make_folder, motion_page, stop_socket
 from station.cell.stillness import RESTING_RAD_S
 from station.protocol.stop_client import ArmMotion, Page, create_page, write_page
 from station.server.approval import Peer
+
+if TYPE_CHECKING:
+    from station.server.dispatch import SessionDispatcher
 
 log = logging.getLogger(__name__)
 
@@ -37,21 +40,12 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(_CREDENTIALS.size)
 
 
 class StopServer:
-    """Server of the STOP socket and writer of the motion page.
+    """Server of the STOP socket and writer of the motion page."""
 
-    `stop` is called at once, in the event loop. `latched` tells whether STOP is latched. `speed_rad_s`
-    returns the fastest joint's speed, None where it is not known.
-    """
-
-    def __init__(
-        self,
-        control: Path,
-        stop: Callable[[Peer], None],
-        latched: Callable[[], bool],
-        speed_rad_s: Callable[[], float | None],
-    ) -> None:
+    def __init__(self, control: Path, dispatcher: SessionDispatcher) -> None:
+        """`control`: path of the control socket, beside which both lie."""
         self._socket_path, self._page_path = stop_socket(control), motion_page(control)
-        self._stop_arm, self._latched, self._speed_rad_s = stop, latched, speed_rad_s
+        self._dispatcher = dispatcher
         self._link: socket.socket | None = None
         self._stops = 0
         self._latched_s = self._repeated_s = float("-inf")
@@ -124,25 +118,25 @@ class StopServer:
     def _carry_out(self, sender: Peer) -> None:
         now_s = time.monotonic()
         self._stops += 1
-        if not self._latched():
+        if not self._dispatcher.latched:
             self._latched_s = now_s
         elif not self._moves() and now_s - self._repeated_s < REPEAT_S:
             return  # the next round updates the page
         self._repeated_s = now_s
-        self._stop_arm(sender)
+        self._dispatcher.stop_by_datagram(sender)
         self._tell()
 
     def _page(self) -> Page:
         return Page(os.getpid(), self._motion(), self._stops)
 
     def _motion(self) -> ArmMotion:
-        if self._speed_rad_s() is None:
+        if self._dispatcher.speed_rad_s is None:
             return ArmMotion.UNKNOWN
         just_stopped = time.monotonic() - self._latched_s < SETTLE_S
         return ArmMotion.MOVES if self._moves() or just_stopped else ArmMotion.RESTS
 
     def _moves(self) -> bool:
-        speed_rad_s = self._speed_rad_s()
+        speed_rad_s = self._dispatcher.speed_rad_s
         return speed_rad_s is not None and speed_rad_s > RESTING_RAD_S
 
     def _tell(self) -> None:

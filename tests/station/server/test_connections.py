@@ -35,6 +35,8 @@ CELL = {
 class RecordingHandler(SessionDispatcher):
     """Remembers what arrived; `slow` answers when told to."""
 
+    status = StationStatus()
+
     def __init__(self) -> None:
         self.order: list[str] = []
         self.lost: list[int] = []
@@ -75,6 +77,11 @@ async def server(tmp_path: Path, handler: RecordingHandler) -> AsyncIterator[tup
 Served = tuple[ClientServer, Path]
 
 
+def publish(control: ClientServer, **changes: Any) -> None:
+    control._handler.status = StationStatus(**changes)
+    control.publish()
+
+
 async def raw(path: Path, *lines: bytes) -> list[dict[str, Any]]:
     reader, writer = await asyncio.open_unix_connection(str(path), limit=1 << 20)
     writer.write(b"".join(lines))
@@ -100,27 +107,24 @@ async def test_watchers_get_everything_once_then_only_changes(server: Served) ->
     async with Client(path) as client:
         statuses = client.statuses()
         assert (await anext(statuses)).state is StationState.DISCONNECTED
-        control.publish(StationStatus(state=StationState.IDLE, cell="lab"))
+        publish(control, state=StationState.IDLE, cell="lab")
         assert (await anext(statuses)).cell == "lab"
-        control.publish(StationStatus(state=StationState.PAUSED, cell="lab"))
+        publish(control, state=StationState.PAUSED, cell="lab")
         newest = await anext(statuses)
         assert (newest.state, newest.cell) == (StationState.PAUSED, "lab")
 
 
 async def test_who_was_answered_knows_what_came_of_it(tmp_path: Path) -> None:
-    state = StationState.IDLE
-
     class Running(RecordingHandler):
         async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> Any:
-            nonlocal state
             if verb == "skip":
-                state = StationState.CHECKING
+                self.status = StationStatus(state=StationState.CHECKING)
             return await super().handle(peer, verb, msgspec.Raw(b'{"index": 0}'))
 
-    control = ClientServer(tmp_path / "s", Running(), lambda: StationStatus(state=state))
+    control = ClientServer(tmp_path / "s", Running())
     await control.start()
     async with Client(tmp_path / "s") as client:
-        assert (await anext(client.statuses())).state is StationState.IDLE
+        assert (await anext(client.statuses())).state is StationState.DISCONNECTED
         await client.request("skip")
         assert (await anext(client.statuses())).state is StationState.CHECKING
     await control.close()
@@ -204,7 +208,7 @@ async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: R
     stuck.send(b'{"id": 1, "verb": "watch"}\n')
     async with Client(path) as client:
         for i in range(200):
-            control.publish(StationStatus(reason=str(i) * 50_000))
+            publish(control, reason=str(i) * 50_000)
             await asyncio.sleep(0)
         assert await client.request("doctor")
         assert len(handler.lost) == 1
@@ -227,7 +231,7 @@ async def test_who_has_control_of_a_moving_arm_and_does_not_read_is_dropped(
             for state in (StationState.IDLE, StationState.MOVING):
                 for holder in (2, 1):
                     assert not handler.lost
-                    control.publish(StationStatus(state=state, lease=LeaseStatus("anna", holder)))
+                    publish(control, state=state, lease=LeaseStatus("anna", holder))
                     await anext(statuses)
             await until(lambda: handler.lost)
             assert handler.lost == [1]

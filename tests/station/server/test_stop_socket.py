@@ -42,6 +42,7 @@ from station.protocol.stop_client import (
 )
 from station.server import stop_server
 from station.server.connections import ClientServer
+from station.server.dispatch import SessionDispatcher
 from station.server.stop_server import Peer, StopServer
 from tests.durability import full
 from tests.patience import PATIENCE_S, until
@@ -51,18 +52,19 @@ NOBODY = 65534
 ONLY_ROOT = pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
 
 
-class Station:
+class Station(SessionDispatcher):
     """A stop server without an arm; `speed_rad_s` is what the arm would say."""
+
+    latched = False
+    speed_rad_s: float | None = 0.0
 
     def __init__(self, control: Path) -> None:
         self.control = control
         self.heard: list[Peer] = []
-        self.latched = False
-        self.speed_rad_s: float | None = 0.0
-        self.server = StopServer(control, self._stop, lambda: self.latched, lambda: self.speed_rad_s)
+        self.server = StopServer(control, self)
         self._beating: asyncio.Task[None] | None = None
 
-    def _stop(self, sender: Peer) -> None:
+    def stop_by_datagram(self, sender: Peer) -> None:
         self.heard.append(sender)
         self.latched = True
 

@@ -67,8 +67,8 @@ class Daemon:
         dispatcher = SessionDispatcher(self.session)
         self._client_server = ClientServer(control, dispatcher)
         self._stop_server = StopServer(control, dispatcher)
-        self.session.supervisor.first = self._stop_server.round
-        self.session.supervisor.ticked = self._ping
+        self.session.supervisor.before_round = self._stop_server.round
+        self.session.supervisor.after_round = self._ping
         self._watchdog_s, self._pinged_s = watchdog_period_s(), 0.0
         self._changed = asyncio.Event()
         self._ending, self._told_to_end = asyncio.Event(), told_to_end

@@ -55,11 +55,6 @@ class Cell:
             raise RefusedError("moved-by-hand", robot=self.arm.identity.model)
         return self.mover
 
-    async def stop(self, reason: str) -> None:
-        """Decelerate the arm now, by both stop paths; an arm that a person moves is sent nothing."""
-        if self.mover is not None:
-            await self.mover.stop(reason)
-
     @property
     def subject(self) -> ArmSubject:
         """Arm, firmware, payload and control path, to which an acceptance test is bound."""

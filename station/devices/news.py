@@ -20,7 +20,7 @@ CURRENT_S = 0.1
 """Largest age of news that count as the present state of the arm."""
 MOVING_S = 0.25
 RESTING_S = 1.0
-TOLD_S = 0.3
+REPORTED_S = 0.3
 """Delay of a resting arm's news above which the delay and its cause are reported."""
 SILENCE_S = 0.15
 """Shortest silence that can have tripped the control program's watchdog (0.2 s less some cycles)."""

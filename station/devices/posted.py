@@ -42,24 +42,25 @@ log = logging.getLogger(__name__)
 SOURCES: dict[Source, str] = {"real": "live", "simulated": "simulated", "playback": "playback"}
 """What a program must declare in a cell of each kind."""
 READ_BYTES, PAUSE_S, LINES_READ = 8192, 0.005, 50
-"""Read at once, then a pause; of what came together only the newest `LINES_READ` lines are parsed."""
+"""So much is read at once, then for `PAUSE_S` nothing; of what came together only the newest `LINES_READ`
+lines are parsed."""
 LINE_BYTES = 2048
 STATES_KEPT = 20_000
-"""Of `HISTORY_S` at most, whatever times are posted."""
-LINKS = 8
-"""Programs connected at once to the socket, and to the port; one has the arm, more are refused at once."""
-DECLARED_S = 3.0
-"""Longest wait for a program's first line, in which it keeps others away."""
-WRONG_S = 1.0
-"""After a wrong post nothing is captured for so long."""
-TOLD_S = 10.0
-"""So long a notice stays."""
+"""Most states kept, however many poses with times within `HISTORY_S` are posted."""
+PROGRAMS = 8
+"""Most programs connected at once to the socket, and as many to the port. Only the first may post."""
+FIRST_LINE_S = 3.0
+"""Longest wait for a program's first line."""
+AFTER_WRONG_S = 1.0
+"""Time after a wrong post in which no image is taken, so that a person sees what is wrong."""
+NOTICE_S = 10.0
+"""Time for which a notice stays on the screen."""
 JUMP_M_S, JUMP_RAD_S = 2.5, 10.0
-"""Ten times the speed to which arms are limited while a person is near (0.25 m/s); faster is a wrong post."""
+"""Speeds above which a post is wrong: ten times the limit for arms beside a person, 0.25 m/s."""
 ARRIVAL_S = 0.1
-"""Posts without a time of their own may have been held up for so long on their way."""
+"""Longest delay assumed of posts without a time of their own, when their speed is judged."""
 CLOCK_STEP_S = 1.0
-"""Step of a program's clock against this computer's that is no delay."""
+"""Smallest step of a program's clock ahead of this computer's that counts as another unit of time."""
 
 
 class PostedArm:
@@ -73,24 +74,25 @@ class PostedArm:
         self.path, self.token_file = post_socket(control), post_token(control)
         self._tcp_port = config.robot.tcp_port
         self._source = source
-        self._late_s = max(CURRENT_S, config.stillness.window_s / 2)
-        """Age up to which a pose is the present one: at least `LEAST_SAMPLES` come in a window of rest."""
-        self._slowest_s = config.stillness.window_s / LEAST_SAMPLES
+        self._current_s = max(CURRENT_S, config.stillness.window_s / 2)
+        """Age up to which a pose is the present one: half the window in which rest is looked for."""
+        self._longest_gap_s = config.stillness.window_s / LEAST_SAMPLES
+        """Longest time between two poses with which rest can be seen."""
         self._servers = list[asyncio.Server]()
         self._links: dict[asyncio.StreamWriter, asyncio.Task[None]] = {}
         """Connected programs, and what serves each."""
         self._poster = ""
         """The program that has the arm; empty: none."""
-        self._late_posted_s = 0.0
-        """How old a pose is when it is posted, as declared."""
+        self._delay_s = 0.0
+        """Age of a pose when it is posted, as the program declares it."""
         self._written: Convention | None = None
         self._callbacks: list[Callable[[RobotState], None]] = []
         self._states: deque[RobotState] = deque(maxlen=STATES_KEPT)
         self._clock: ClockEstimator | None = None
         """None: the posts have no time of their own."""
         self._wrong: StaleStateError | None = None
-        self._wrong_s = self._told_s = 0.0
-        self._came = asyncio.Event()
+        self._wrong_since_s = self._notice_since_s = 0.0
+        self._first_pose = asyncio.Event()
 
     # -- as an arm ---------------------------------------------------------------------------------------
 
@@ -108,7 +110,7 @@ class PostedArm:
                 except StationError:
                     await self.close()  # or the next attempt would wait without that port
                     raise
-        await self._came.wait()
+        await self._first_pose.wait()
         return self.identity
 
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
@@ -120,16 +122,16 @@ class PostedArm:
         return state
 
     def news(self) -> RobotState | None:
-        if time.monotonic() > self._told_s + TOLD_S:
+        if time.monotonic() > self._notice_since_s + NOTICE_S:
             self.notice = ""
-        if self._wrong is not None and time.monotonic() < self._wrong_s + WRONG_S:
+        if self._wrong is not None and time.monotonic() < self._wrong_since_s + AFTER_WRONG_S:
             raise self._wrong
         if not self._poster or not self._states:
             raise StaleStateError("post-nobody", robot=self.identity.model, socket=self.path)
         age_s = self._age_s()
-        if age_s > max(RESTING_S, self._late_s):
+        if age_s > max(RESTING_S, self._current_s):
             raise self._silent()
-        return self._states[-1] if age_s <= self._late_s else None
+        return self._states[-1] if age_s <= self._current_s else None
 
     def check(self) -> RobotState | None:
         return self.news()
@@ -147,7 +149,7 @@ class PostedArm:
         """The program's clock against the host's, or how late poses by arrival may be."""
         if self._clock is not None:
             return self._clock.fit()
-        return ClockFit(0.0, 0.0, self._late_posted_s + PAUSE_S) if self._states else None
+        return ClockFit(0.0, 0.0, self._delay_s + PAUSE_S) if self._states else None
 
     async def close(self) -> None:
         if self._servers:
@@ -156,7 +158,7 @@ class PostedArm:
             for link in self._links:
                 link.transport.abort()
             if self._links:
-                await asyncio.wait(self._links.values(), timeout=DECLARED_S)
+                await asyncio.wait(self._links.values(), timeout=FIRST_LINE_S)
             self.path.unlink(missing_ok=True)
             self.token_file.unlink(missing_ok=True)
 
@@ -188,8 +190,8 @@ class PostedArm:
             self._links[writer] = serving
         try:
             # Socket and port each have this limit, or strangers at the port would keep programs out.
-            if sum(one.get_extra_info("socket").family == family for one in self._links) > LINKS:
-                raise RobotError("post-refused", poster=poster, reason=f"{LINKS} programs are connected")
+            if sum(one.get_extra_info("socket").family == family for one in self._links) > PROGRAMS:
+                raise RobotError("post-refused", poster=poster, reason=f"{PROGRAMS} programs are connected")
             if token and not await _gives(token, reader):
                 raise RobotError("post-token", file=self.token_file)
             if self._poster:
@@ -198,15 +200,15 @@ class PostedArm:
             await self._take(reader)
         except (StationError, OSError) as error:
             if link.family is socket.AF_UNIX or holds or not self._poster:
-                self._tell(str(error))
+                self._notify(str(error))
             answer = {"code": getattr(error, "code", "socket"), "text": str(error)}
             with contextlib.suppress(OSError):
                 writer.write(msgspec.json.encode(answer) + b"\n")
-                await asyncio.wait_for(writer.drain(), DECLARED_S)
+                await asyncio.wait_for(writer.drain(), FIRST_LINE_S)
         finally:
             if holds:
                 self._poster = ""
-                self._begin_anew()
+                self._forget()
             self._links.pop(writer, None)
             writer.close()
 
@@ -214,7 +216,7 @@ class PostedArm:
         """Take a program's lines until it ends. RobotError where it is none for this cell."""
         lines, wanted, model = _lines(reader), SOURCES[self._source], self.identity.model
         try:
-            first, *others = await asyncio.wait_for(anext(lines), DECLARED_S)
+            first, *others = await asyncio.wait_for(anext(lines), FIRST_LINE_S)
         except (TimeoutError, StopAsyncIteration):
             raise RobotError("post-undeclared", reason="nothing was written") from None
         declared, self._written = read_declaration(first)
@@ -224,7 +226,7 @@ class PostedArm:
         if declared.robot and declared.robot != model:
             reason = f"it posts the arm {declared.robot}, the cell's is {model}"
             raise RobotError("post-refused", poster=self._poster, reason=reason)
-        self._late_posted_s, self._clock = declared.late_s, None
+        self._delay_s, self._clock = declared.late_s, None
         self._posts(others)
         async for some in lines:
             self._posts(some)
@@ -232,66 +234,66 @@ class PostedArm:
     def _posts(self, lines: list[bytes]) -> None:
         arrived_ns = time.monotonic_ns()
         if len(lines) > LINES_READ:
-            self._tell(f"{self._poster} posts too fast: only the newest poses are read")
+            self._notify(f"{self._poster} posts too fast: only the newest poses are read")
         try:
             found = [read_post(line, self._written) for line in lines[-LINES_READ:] if line.strip()]
             for post, pose in found if found and found[-1][0].t is not None else found[-1:]:
                 self._add(post, pose, arrived_ns)
         except StaleStateError as error:
-            self._wrong, self._wrong_s = StaleStateError.from_data(error.data), time.monotonic()
+            self._wrong, self._wrong_since_s = StaleStateError.from_data(error.data), time.monotonic()
 
     def _add(self, post: Post, pose: Vector6, arrived_ns: int) -> None:
         before = self._states[-1] if self._states else None
         if (post.t is None) is not (self._clock is None):
-            self._begin_anew()
-            before, self._clock = None, None if post.t is None else ClockEstimator(self._late_posted_s)
-        told_s = arrived_ns / 1e9 if post.t is None else post.t
+            self._forget()
+            before, self._clock = None, None if post.t is None else ClockEstimator(self._delay_s)
+        posted_s = arrived_ns / 1e9 if post.t is None else post.t
         wrong: StaleStateError | None = None
         if before is not None:
-            step_s = told_s - before.stamps.controller_s
+            step_s = posted_s - before.stamps.controller_s
             waited_s = (arrived_ns - before.stamps.host_monotonic_ns) / 1e9
             if step_s == 0:
                 return  # posted again: no news
             if step_s > waited_s + CLOCK_STEP_S:
                 wrong = StaleStateError("post-clock", step_s=step_s, passed_s=waited_s)
             if step_s < 0 or wrong is not None:
-                self._begin_anew()
+                self._forget()
             else:
                 least_s = ARRIVAL_S if post.t is None else PAUSE_S
                 wrong = _jump(before.tcp_pose, pose, max(step_s, least_s))
         if self._clock is not None:
-            self._clock.add(told_s, arrived_ns)
+            self._clock.add(posted_s, arrived_ns)
         joints = post.joints_rad or ()
-        stamps = Stamps(arrived_ns, time.time_ns(), told_s)
+        stamps = Stamps(arrived_ns, time.time_ns(), posted_s)
         self._states.append(RobotState(stamps, joints, (), joints, pose))
-        while self._states[0].stamps.controller_s < told_s - HISTORY_S:
+        while self._states[0].stamps.controller_s < posted_s - HISTORY_S:
             self._states.popleft()
-        span_s = told_s - self._states[0].stamps.controller_s
-        if span_s > max(RESTING_S, self._slowest_s * (len(self._states) - 1)):
-            least = f"{1 / self._slowest_s:.0f} poses a second"
-            self._tell(f"rest is seen from {least} on: post faster, or raise stillness.window_s")
+        span_s = posted_s - self._states[0].stamps.controller_s
+        if span_s > max(RESTING_S, self._longest_gap_s * (len(self._states) - 1)):
+            least = f"{1 / self._longest_gap_s:.0f} poses a second"
+            self._notify(f"rest is seen from {least} on: post faster, or raise stillness.window_s")
         for callback in self._callbacks:
             callback(self._states[-1])
-        self._came.set()
+        self._first_pose.set()
         if wrong is not None:
             raise wrong
 
-    def _begin_anew(self) -> None:
+    def _forget(self) -> None:
         """Forget what belongs to another clock."""
         self._states.clear()
         if self._clock is not None:
-            self._clock = ClockEstimator(self._late_posted_s)
+            self._clock = ClockEstimator(self._delay_s)
 
-    def _tell(self, notice: str) -> None:
+    def _notify(self, notice: str) -> None:
         if notice != self.notice:
             log.warning("%s", notice)
-        self.notice, self._told_s = notice, time.monotonic()
+        self.notice, self._notice_since_s = notice, time.monotonic()
 
 
 async def _gives(token: bytes, reader: asyncio.StreamReader) -> bool:
     """Tell whether a program's first line is the token."""
     try:
-        first = await asyncio.wait_for(reader.readline(), DECLARED_S)
+        first = await asyncio.wait_for(reader.readline(), FIRST_LINE_S)
     except (TimeoutError, ValueError):  # ValueError: a line that never ends
         return False
     return secrets.compare_digest(first.strip(), token)

@@ -245,9 +245,10 @@ class UrRobot(UrLink):
         return link_lost(self._link_loss) if self._link_loss else error
 
     async def stop(self, reason: str) -> None:
-        """Decelerate now, by both stop paths, and end control; idempotent, in any state, never raises.
+        """Decelerate now, by both ways out, and end control; idempotent, in any state, never raises.
 
-        The dashboard's stop is sent also without control: it ends another client's program, too.
+        The ways: the control process, and the dashboard's `stop`. That is sent also without control: it ends
+        another client's program, too. How STOP comes here: `protocol.stop_client`.
         """
         self._stop_reason = self._stop_reason or reason
         child, self._child, self.control = self._child, None, False

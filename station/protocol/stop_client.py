@@ -1,8 +1,14 @@
 """STOP as everybody sends it: one datagram. `station stop`, without slow imports, then checks its effect.
 
-Every sender is here: `station stop`, the process that reads the screen's F12 (`tui.stop_key`), and the screen
-itself (`protocol.client`). The screen sends it too because its block can be clicked and a terminal may be
-without that process, and asks the verb `stop` besides: a datagram has no answer. A STOP more does no harm.
+From a person to the wire:
+  1. `send_stop` here, called by `station stop`, by the process that reads the screen's F12 (`tui.stop_key`),
+     and by `protocol.client` before the verb `stop`: for the screen and for Ctrl-C at a command. The screen
+     sends both because it can be clicked, and a datagram has no answer. A STOP more does no harm.
+  2. In the daemon `server.stop_server` reads the datagram, `server.connections` the verb. Both call
+     `server.dispatch`, and this `session.session.Session.stop`, then `_halt`. The loss of control and the
+     daemon's end lead to `_halt`, too.
+  3. `devices.ur.UrRobot.stop` sends it out by two ways at once: port 29999 (`ur_dashboard`), and the control
+     process (`ur_child`, `ur_control`), which calls `stopJ` of ur_rtde or `ur_script`.
 
 STOP is sent to whatever listens on the socket. It is reported as done only if the genuine daemon says so on
 the motion page, a small file beside the socket that only the daemon's user can have made. It tells how many

@@ -67,7 +67,7 @@ class Run:
         except SafetyStopError as error:
             failed(self._context, error)  # the controller itself stopped the arm
         except Exception as error:
-            await self._context.cell.stop(str(error))
+            await self._mover.stop(str(error))
             if isinstance(error, StationError) and self._may_go_on(error):
                 return error
             failed(self._context, error)

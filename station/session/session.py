@@ -141,10 +141,13 @@ class Session:
     # -- stopping, by anyone and anything ----------------------------------------------------------------
 
     async def stop(self, who: str) -> None:
-        """Stop the arm now, from any client, in any state; latched until acknowledged."""
+        """Stop the arm now, from any client, in any state; latched until acknowledged.
+
+        How STOP comes here, and goes on: `protocol.stop_client`.
+        """
         self._stops += 1
         if self.store.state is StationState.STOPPED:
-            await self.context.cell.stop(f"STOP by {who}")
+            await self._stop_arm(f"STOP by {who}")
             return
         sent = "" if self.context.cell.mover is not None else " Nothing was sent: use the arm's own pendant."
         await self._halt(StationState.STOPPED, f"STOP by {who}.{sent}", "stop")
@@ -171,10 +174,15 @@ class Session:
         self.store.enter(state, reason, cause)
         if run is not None:
             run.cancel()
-        await context.cell.stop(reason)
+        await self._stop_arm(reason)
         self.store.event(cause, reason, "warning")
         if run is not None:
             await asyncio.wait({run}, timeout=STOP_WAIT_S)
+
+    async def _stop_arm(self, reason: str) -> None:
+        """Decelerate the arm by both ways (`devices.ur.UrRobot.stop`); nothing where a person moves it."""
+        if (mover := self.context.cell.mover) is not None:
+            await mover.stop(reason)
 
     async def acknowledge(self, who: str) -> None:
         """Leave `stopped` or `fault` after a person looked at the cell."""

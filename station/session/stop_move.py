@@ -117,7 +117,7 @@ async def stop_half_way(
     except SafetyStopError:
         raise
     except (RobotError, LimitError) as error:
-        await context.cell.stop("stop test")
+        await context.cell.require_mover().stop("stop test")
         said, ended_by = str(error), error.code
     finally:
         driving.cancel()

@@ -20,7 +20,7 @@ from station.cell.errors import RobotError, StaleStateError
 from station.cell.layout import cell_geometry
 from station.cell.limits import point_speed_m_s
 from station.cell.status import CameraStatus, RecorderStatus, RobotStatus, StationState, TriggerStatus
-from station.devices.news import CURRENT_S, TOLD_S, Delay
+from station.devices.news import CURRENT_S, REPORTED_S, Delay
 from station.protocol.states import RUNNING
 from station.session.context import SessionContext
 from station.session.threads import WATCH
@@ -114,17 +114,16 @@ STATUS_TICKS = 5
 
 
 class SessionSupervisor:
-    def __init__(self, context: SessionContext, lost: Callable[[], None]) -> None:
-        """`lost`: called when the arm's states are too late."""
+    def __init__(self, context: SessionContext, void_approvals: Callable[[], None]) -> None:
         self._context = context
         self.monitor = Monitor(context)
-        self._lost = lost
-        self.first: Callable[[], None] = lambda: None
-        """Called first in every round: the daemon reads STOP's socket here, too."""
-        self.ticked: Callable[[], None] = lambda: None
-        """Called after every round: the daemon tells systemd's watchdog."""
-        self._silent = ""
-        """Code of what is wrong while the robot's states are later than allowed; empty: they are not."""
+        self._void_approvals = void_approvals
+        self.before_round: Callable[[], None] = lambda: None
+        """Called at the begin of every round: the daemon reads STOP's socket here, too."""
+        self.after_round: Callable[[], None] = lambda: None
+        """Called at the end of every round: the daemon pings systemd's watchdog."""
+        self._lost_code = ""
+        """Error code while the arm's states are later than allowed; empty: they are not."""
         self._late_since_s = 0.0
         """Since when states are late (host monotonic); 0: they are not."""
         self.lags_s: deque[float] = deque(maxlen=50)
@@ -142,13 +141,13 @@ class SessionSupervisor:
             await asyncio.sleep(max(0.0, due_s - time.monotonic()))
 
     def _round(self, number: int) -> None:
-        self.first()
+        self.before_round()
         if self._context.store.state in RUNNING and (mover := self._context.cell.mover) is not None:
             mover.heartbeat()
         if number % STATUS_TICKS == 0:
             self._watch_link()
             self.monitor.refresh()
-        self.ticked()
+        self.after_round()
 
     def _watch_link(self) -> None:
         """Switch between idle and disconnected; during a run the run itself detects a lost robot."""
@@ -158,9 +157,9 @@ class SessionSupervisor:
                 self._late_since_s = self._late_since_s or time.monotonic()
                 return
         except StaleStateError as error:
-            if not self._silent:
-                self._lost()
-            new, self._silent = error.code != self._silent, error.code
+            if not self._lost_code:
+                self._void_approvals()
+            new, self._lost_code = error.code != self._lost_code, error.code
             if store.state is StationState.DISCONNECTED:
                 store.update(reason=str(error), cause=error.code)
             elif store.state is StationState.IDLE:
@@ -169,20 +168,20 @@ class SessionSupervisor:
             elif new and store.state is StationState.FREE_DRIVE:
                 store.problem(error)
             return
-        self._silent = ""
+        self._lost_code = ""
         if self._late_since_s:
-            self._tell_delay(self._late_since_s)
+            self._report_delay(self._late_since_s)
             self._late_since_s = 0.0
         if store.state is StationState.DISCONNECTED:
             store.enter(self._context.resting)
             store.event("robot-connected", "robot connected")
 
-    def _tell_delay(self, since_s: float) -> None:
+    def _report_delay(self, since_s: float) -> None:
         """Report what made states of a resting arm late."""
         store, now_s = self._context.store, time.monotonic()
-        late = self._context.cell.arm.delay(max(self.lags_s, default=0.0), since_s - TOLD_S)
+        late = self._context.cell.arm.delay(max(self.lags_s, default=0.0), since_s - REPORTED_S)
         now_ns, late_ns = time.time_ns(), round(1e9 * (now_s - since_s))
         recent = (e.code for e in store.status.events if 0 <= now_ns - e.wall_ns < late_ns)
         told = not set(Delay).isdisjoint(recent)
-        if late is not None and now_s - since_s > TOLD_S - CURRENT_S and not told:
+        if late is not None and now_s - since_s > REPORTED_S - CURRENT_S and not told:
             store.problem(late)

@@ -184,7 +184,7 @@ WRONG = {
 async def test_a_wrong_post_is_named_and_nothing_is_taken_until_right_ones_go_on(
     arm: PostedArm, monkeypatch: pytest.MonkeyPatch, case: str
 ) -> None:
-    monkeypatch.setattr(posted, "WRONG_S", PATIENCE_S)
+    monkeypatch.setattr(posted, "AFTER_WRONG_S", PATIENCE_S)
     poster = await Poster.at(arm)
     await poster.rest(5)
     await until(lambda: trouble(arm) == "")
@@ -194,7 +194,7 @@ async def test_a_wrong_post_is_named_and_nothing_is_taken_until_right_ones_go_on
     poster.post()
     await asyncio.sleep(0.02)
     assert trouble(arm) == code, "for as long as a person needs to see it"
-    monkeypatch.setattr(posted, "WRONG_S", 0.0)
+    monkeypatch.setattr(posted, "AFTER_WRONG_S", 0.0)
     poster.t += 0.02 + 1e6 * (case == "milliseconds")
     async with asyncio.timeout(PATIENCE_S):
         while trouble(arm):
@@ -251,9 +251,9 @@ async def test_a_program_by_tcp_gives_the_token_first_and_is_one_as_any_other(
 async def test_programs_that_give_no_token_do_not_pile_up_nor_keep_others_out(
     arm: PostedArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(posted, "DECLARED_S", PATIENCE_S)
+    monkeypatch.setattr(posted, "FIRST_LINE_S", PATIENCE_S)
     door = ("127.0.0.1", arm._tcp_port)
-    *_others, last = [Poster(*await asyncio.open_connection(*door)) for _ in range(posted.LINKS + 1)]
+    *_others, last = [Poster(*await asyncio.open_connection(*door)) for _ in range(posted.PROGRAMS + 1)]
     assert await last.refused() == "post-refused"
     await (await Poster.at(arm)).rest(3)
     await until(lambda: trouble(arm) == "")

@@ -60,7 +60,7 @@ async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) 
     assert rig.session.store.status.robot.condition.held == ""
 
 
-@pytest.mark.parametrize("place", ["first", "ticked", "_watch_link"])
+@pytest.mark.parametrize("place", ["before_round", "after_round", "_watch_link"])
 async def test_a_defect_in_the_heartbeats_loop_stops_the_arm_in_fault_and_the_loop_goes_on(
     rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, place: str
 ) -> None:
@@ -84,9 +84,9 @@ async def test_a_defect_in_the_stop_that_follows_a_defect_is_logged_too(
     rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(rig.session.supervisor, "first", Mock(side_effect=ZeroDivisionError))
+        patch.setattr(rig.session.supervisor, "before_round", Mock(side_effect=ZeroDivisionError))
         patch.setattr(rig.arm, "stop", Mock(side_effect=IndexError))
         await rig.until(S.FAULT)
-        await until(lambda: rig.session.supervisor.first.call_count > 1)
+        await until(lambda: rig.session.supervisor.before_round.call_count > 1)
     logged = [record.exc_info[0] for record in caplog.records if record.exc_info]
     assert logged == [ZeroDivisionError, IndexError]

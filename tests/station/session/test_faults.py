@@ -81,14 +81,12 @@ async def test_a_disk_that_fails_is_a_fault_and_never_a_pose_and_so_is_a_defect(
     assert ("move" in rig.arm.log) == (method == "sync")
 
 
-@pytest.mark.parametrize("fault", ["full", "takes no file"])
-async def test_a_disk_on_which_nothing_can_be_recorded_is_told_before_anybody_is_asked(
-    rig: Rig, fault: str
-) -> None:
-    if fault == "full":
-        rig.configure(capture={"free_space_bytes": 10**18})
-    else:
-        (rig.session.context.root / ".write-test").mkdir()
+async def test_a_disk_that_takes_no_file_or_is_full_is_told_before_anybody_is_asked(rig: Rig) -> None:
+    (probe := rig.session.context.root / ".write-test").mkdir()
+    with raises("disk-full"):
+        await rig.session.prepare(1, Purpose.RUN)
+    probe.rmdir()
+    rig.configure(capture={"free_space_bytes": 10**18})
     with raises("disk-full"):
         await rig.session.prepare(1, Purpose.RUN)
 

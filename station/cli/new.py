@@ -58,7 +58,6 @@ class OpenCamera:
     def __init__(self, found: CameraChoice) -> None:
         self._config = CameraConfig(driver=found.driver, device=found.device)  # type: ignore[arg-type]
         self._camera = _DRIVERS[found.driver](self._config)
-        self._changing = asyncio.Lock()
 
     @property
     def exposure_us(self) -> float:
@@ -68,17 +67,15 @@ class OpenCamera:
         await self._camera.open()
 
     async def glimpse(self) -> Image:
-        async with self._changing:
-            return await self._camera.glimpse()
+        return await self._camera.glimpse()
 
     async def expose(self, exposure_us: float) -> None:
         if exposure_us == self._config.exposure_us:
             return
-        async with self._changing:
-            await self._camera.close()
-            self._config = msgspec.structs.replace(self._config, exposure_us=round(exposure_us, 1))
-            self._camera = type(self._camera)(self._config)
-            await self._camera.open()
+        await self._camera.close()
+        self._config = msgspec.structs.replace(self._config, exposure_us=round(exposure_us, 1))
+        self._camera = type(self._camera)(self._config)
+        await self._camera.open()
 
     async def close(self) -> None:
         await self._camera.close()

@@ -65,7 +65,7 @@ class NewCell(LivePageApp[Ending]):
         Binding("o", "open_live", "Live picture", tooltip="The live picture, large, in a browser"),
         Binding("f7", "table_here", "Table here", tooltip="The table is as high as the tool now"),
         Binding("f9", "rehearse", "Rehearse", tooltip="Run the whole job with this cell in simulation"),
-        Binding("escape", "leave", "Leave", tooltip="Leave; what was found is kept"),
+        Binding("escape", "quit", "Leave", tooltip="Leave; what was found is kept"),
     ]
     step: reactive[CellStep] = reactive(CellStep.ROBOT, init=False)
 
@@ -199,9 +199,6 @@ class NewCell(LivePageApp[Ending]):
             "The controller confirmed STOP. If the arm moves, press the EMERGENCY STOP.",
             severity="warning",
         )
-
-    def action_leave(self) -> None:
-        self.exit("")
 
     def action_go(self, by: int) -> None:
         at = STEPS.index(self.step) + by

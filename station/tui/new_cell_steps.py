@@ -114,9 +114,7 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
     draft = setup.draft
     match step:
         case CellStep.ROBOT if setup.arm is None and not draft.posted:
-            wrong = any(part.isdecimal() and int(part) > 255 for part in text.split(".")[:4])
-            why = "Numbers of an address go up to 255." if wrong else "then Enter."
-            return Action("", "Type the address", why, look=wrong)
+            return Action("", "Type the address", "then Enter.")
         case CellStep.ROBOT:
             why = "You move the arm." if draft.posted else "The arm is read."
             return Action("Enter", "On to the camera", why)

@@ -51,9 +51,9 @@ class DashboardConnection(Connection):
     def _answer(self, verb: str) -> str:
         robot = self._robot
         if verb not in self._known:
-            error = f"could not understand: {verb}{'' if verb in VERBS else f': {NOT_SUPPORTED}'}"
-            robot.journal.note("dashboard", verb[:200], refused=True, error=error[:300])
-            return error
+            error = "" if verb in VERBS else NOT_SUPPORTED
+            robot.journal.note("dashboard", verb[:200], refused=True, error=error)
+            return ": ".join(filter(None, ("could not understand", verb, error)))
         local = robot.settings.is_e_series and (not robot.remote or self._opened_in_local)
         refused = local and verb == "stop"
         robot.journal.note("dashboard", verb, refused=refused)

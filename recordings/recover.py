@@ -143,7 +143,7 @@ def _recover_file(source: Path, output: Path | None) -> Recovery:
         final = output or source.with_name(source.name.removesuffix(PART_SUFFIX))
         if final.suffix != ".mcap":
             raise RecordingError("recording-name", path=final)
-        if final != source and os.path.lexists(final):
+        if (output or final != source) and os.path.lexists(final):
             raise exists_error(final)
         try:
             segment = RecordingSegment(source)

@@ -196,8 +196,9 @@ def test_a_lost_first_page_of_the_disk_leaves_the_other_poses(tmp_path: Path, un
     path = make(tmp_path / "a.mcap", poses=9)
     path.write_bytes(bytes(4096) + path.read_bytes()[4096:])
     before, taken = path.read_bytes(), write_small(tmp_path / "taken.mcap")
-    with refused("exists"):
-        recover_recording(path, taken)
+    for there, code in ((taken, "exists"), (path, "recording-name" if unfinished else "exists")):
+        with refused(code):
+            recover_recording(path, there)
     (result,) = recover_recording(path, tmp_path / "saved.mcap")
     assert result.poses >= 8 and result.kept_original == path and path.read_bytes() == before
 

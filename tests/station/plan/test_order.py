@@ -16,15 +16,15 @@ from station.plan.order import BLOCKED, move_times, path_time, short_order
 REST = np.deg2rad([0.0, -100.0, -100.0, -70.0, 90.0, 0.0])
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_a_small_tour_is_within_5_percent_of_the_best_of_all(seed):
+@pytest.mark.parametrize(("seed", "count"), [*((seed, 7) for seed in range(6)), (6, 1)])
+def test_a_small_tour_is_within_5_percent_of_the_best_of_all(seed, count):
     rng = np.random.default_rng(seed)
-    places = rng.uniform(size=(7, 2))
+    places = rng.uniform(size=(count, 2))
     times = np.linalg.norm(places[:, None] - places, axis=2)
     lead = np.linalg.norm(places, axis=1)
-    best = min(path_time(list(order), times, lead) for order in permutations(range(7)))
+    best = min(path_time(list(order), times, lead) for order in permutations(range(count)))
     order = short_order(times, lead, seed)
-    assert sorted(order) == list(range(7))
+    assert sorted(order) == list(range(count))
     assert path_time(order, times, lead) <= 1.05 * best
 
 
@@ -34,10 +34,6 @@ def test_a_blocked_move_is_gone_around():
     times[2, 3] = times[3, 2] = BLOCKED
     order = short_order(times, np.zeros(6), 0)
     assert np.isfinite(path_time(order, times, np.zeros(6)))
-
-
-def test_a_single_pose_is_its_own_order():
-    assert short_order(np.zeros((1, 1)), np.zeros(1), 0) == [0]
 
 
 def test_free_and_blocked_agree_with_the_dense_check():

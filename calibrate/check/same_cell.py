@@ -24,7 +24,7 @@ def require_same_cell(
 ) -> None:
     """Raise OtherCellError for views of another mounting, robot or camera, or simulated and real ones.
 
-    An empty serial number is not known, and differs from none.
+    A device that tells no serial number counts as the same.
     """
     for name, found, calibrated in (
         ("mounting", mount, calibration.mount),

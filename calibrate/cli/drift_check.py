@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -27,7 +25,7 @@ from calibrate.errors import CalibrationError, InstallError
 from calibrate.files.calibration import Calibration, Provenance
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
-from calibrate.files.validity import Validity, ValidityReason, validity_text
+from calibrate.files.validity import ValidityReason, validity_text
 from calibrate.files.versions import installed_versions, same_solve
 from calibrate.job import JobOptions, prepare_views
 from recordings.files import MAIN_CAMERA, state_root
@@ -88,7 +86,7 @@ def drift_check(
             recording, options, progress, fewest=1 if production else FEWEST_FOR_DRIFT_CHECK
         )
     info = prepared.recording.info
-    note = None if held is None else partial(note_check, root, camera=camera, version=held.version)
+    version = None if held is None else held.version  # None: a named file, of which nothing is noted
     own, trend, validity, before, unnoted = False, None, None, list[bool](), None
     if production:
         if (mount := info.mount) != calibration.mount:
@@ -96,17 +94,18 @@ def drift_check(
         result = check_production(prepared.views, known_cell(calibration, prepared.loaded.board))
         text = production_text(result, len(prepared.views))
     else:
-        _require_this_cell(source, info, calibration, root, note)
+        _require_this_cell(source, info, calibration, root, camera, version)
         result = check_drift(prepared.views, calibration, prepared.loaded.board)
         text = check_text(result, calibration)
         own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
     try:
-        if note is not None and production and not result.passed:  # no alarm is no proof
-            validity = note(*_judged(result, source.name), datetime.now(UTC))
-        elif note is not None and held is not None and not production and not own:
-            validity = note(*_judged(result, info.name), _taken(info))
-            board_now = prepared.loaded.board
-            before, trend = _log(result, calibration, info, board_now, root, camera, held.version)
+        if version is not None and production and not result.passed:  # no alarm is no proof
+            verdict = _judged(result, source.name)
+            validity = note_check(root, *verdict, datetime.now(UTC), camera=camera, version=version)
+        elif version is not None and not production and not own:
+            verdict = _judged(result, info.name)
+            validity = note_check(root, *verdict, _taken(info), camera=camera, version=version)
+            before, trend = _log(result, calibration, info, prepared.loaded.board, root, camera, version)
     except InstallError as problem:
         if problem.code == "other-version":
             raise
@@ -186,7 +185,8 @@ def _require_this_cell(
     info: SessionInfo,
     calibration: Calibration,
     root: Path | None,
-    note: Callable[[ValidityReason, bool, bool, datetime], Validity] | None,
+    camera: str,
+    version: int | None,
 ) -> None:
     """Refuse views of another cell; a session of this cell with another device doubts what is installed."""
     try:
@@ -194,9 +194,9 @@ def _require_this_cell(
         require_same_cell(str(recording), calibration, info.mount, info.source, *serials)
     except OtherCellError as other:
         own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
-        if note is not None and own and other.device:
+        if version is not None and own and other.device:
             reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))
-            note(reason, False, True, _taken(info))
+            note_check(root, reason, False, True, _taken(info), camera=camera, version=version)
         raise
 
 

@@ -5,7 +5,9 @@ file holds; the command and docs/reference/formats.md take them from there. `vis
 
 It is given the calibration and the names of frames. The camera's place is `calibration.transform.matrix`,
 the optical frame in its parent, (4, 4) in metres; its lens `calibration.intrinsics.model`. It returns the
-file's text, which holds `frames.comment` as a comment or a text of its own.
+file's text, which holds `frames.comment` as a comment or a text of its own. A reader in
+tests/foreign/export_readers.py, by another library or that program's own rule, must find 500 known points
+where the calibration shows them.
 """
 
 from __future__ import annotations

@@ -22,7 +22,8 @@ from station.cell.status import GuidanceStatus
 from station.cell.stillness import StillnessMonitor
 
 GIVE_UP_S = 5.0
-"""Rest at a place that is not new after which another view is asked for."""
+"""Rest at a place that is not new after which another view is asked for; and after an image that failed
+before it is tried again: lateness passes, and a person who sees everything rest would wait for ever."""
 _CHOOSE_S = 20.0
 R = TypeVar("R")
 
@@ -59,14 +60,14 @@ class HandGuide:
         self._seen: BoardDetection | None = None
         self._motion_px: float | None = None
         """Motion of the board between the last two images; None: it was not seen in both."""
-        self._moved_s, self._failed = 0.0, False
-        """When something moved last; whether an image failed or was taken back since: no other is tried."""
+        self._moved_s = self._again_s = 0.0
+        """When something moved last; from when on an image is tried, where one failed or was taken back."""
         self._count = 0
         """Number of views at the last look."""
 
     def taken(self, kept: bool) -> None:
         """Tell what came of the view that was to be taken."""
-        self._failed = not kept
+        self._again_s = 0.0 if kept else time.monotonic() + GIVE_UP_S
         self._count += kept  # it may be taken back before the next look
 
     async def look(
@@ -81,7 +82,8 @@ class HandGuide:
         `cell`: as `next_view` takes it. `views`: those that count; `seen`: the board in `image`.
         """
         self.take = False
-        self._failed |= len(views) < self._count  # one was taken back: none again from here
+        if len(views) < self._count:  # one was taken back: none again from here
+            self._again_s = float("inf")
         self._count = len(views)
         wanted, way = await self._next(cell, views), Way("", False)
         if seen.status.found:
@@ -100,8 +102,9 @@ class HandGuide:
         if found is not None:
             moves, still = self._stillness.unrest(found), self._stillness.rest(found)
         if (found is not None and moves) or self._motion_px is None:
-            self._moved_s, self._failed = time.monotonic(), False
-        if not moves and self._motion_px is not None and seen.status.cause != "blurred" and not self._failed:
+            self._moved_s, self._again_s = time.monotonic(), 0.0
+        tried = time.monotonic() < self._again_s
+        if not moves and self._motion_px is not None and seen.status.cause != "blurred" and not tried:
             self.take = way.new
             if not way.new and seen.status.found and time.monotonic() - self._moved_s > GIVE_UP_S:
                 self._given_up.append(wanted.camera_from_board)

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from recordings.info import recording_info
+from station.analysis import hand_guide
 from station.analysis.hand_guide import HandGuide
 from station.analysis.pool import WorkerError
 from station.cell.config import vector6
@@ -18,7 +19,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Skip
 from station.session import capture
 from tests.codes import raises
-from tests.patience import until
+from tests.patience import PATIENCE_S, until
 from tests.station.operate.guided_views import guided_joints
 from tests.station.session.test_estimator import WorkerThatLooksBack, WorkerThatSees
 from tests.station.session_rig import TRUTH, NewRig, Rig, crash, sealed
@@ -139,6 +140,7 @@ async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:
 async def test_what_could_not_be_checked_is_kept_only_for_who_asked(
     guided: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(hand_guide, "GIVE_UP_S", PATIENCE_S)
     await until(lambda: captured(guided) == 1 and guided.state is S.FREE_DRIVE)
     late = Mock(side_effect=WorkerError("worker-late", function="sight"))
     monkeypatch.setattr(capture, "sight", late)
@@ -147,6 +149,18 @@ async def test_what_could_not_be_checked_is_kept_only_for_who_asked(
     assert guided.pose_states == ["done"]
     await guided.session.record(1)
     assert guided.pose_states == ["done", "done"]
+
+
+async def test_what_failed_once_is_tried_again_without_a_nudge(
+    guided: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hand_guide, "GIVE_UP_S", 0.05)
+    await until(lambda: captured(guided) == 1 and guided.state is S.FREE_DRIVE)
+    with monkeypatch.context() as now:
+        now.setattr(capture, "sight", Mock(side_effect=WorkerError("worker-late", function="sight")))
+        lead(guided, guided_joints(TRUTH)[1])
+        await until(lambda: guided.told("not-checked"))
+    await until(lambda: captured(guided) == 2)
 
 
 async def test_an_arm_that_tells_no_pose_neither_rests_nor_moves(guided: Rig) -> None:

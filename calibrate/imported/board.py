@@ -172,7 +172,14 @@ def _likely(
         known = each.square_m > 0
         board = each if known else msgspec.structs.replace(each, square_m=GUESSED_M)
         progress(n, n + 1, f"trying a {board.kind.value} {board.columns}×{board.rows}")
+        part = any(
+            (shown is not None and not knew and board.kind is larger.kind)
+            and (board.columns <= larger.columns and board.rows <= larger.rows)
+            for _, larger, knew in counted
+        )  # of circles that one image shows whole; a part of a chessboard is not found
         try:
+            if part and board.kind is not BoardKind.CHESSBOARD:
+                continue
             if shown is not None and not detect(shown, board, True, False).found:
                 continue
             seen = [detect(image, board, False) for image in images]

@@ -67,7 +67,9 @@ def believe(
             return _as_before(held, told, told.poses)
         given = Given(given.convention, given.mount or told.mount, given.board or told.board)
     named, unnamed = ([t for t in held.tables if t.whose == whose] for whose in ("robot", ""))
-    robots = (named or unnamed) if held.told is None else held.told
+    robots = named or unnamed
+    if held.told is not None:  # a file that is told may hold the board's poses, too
+        robots = [table for table in held.told if table.whose != "board"] or held.told
     boards = [
         (robot, board, pairs)
         for robot in robots

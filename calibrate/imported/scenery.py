@@ -40,9 +40,13 @@ def mount_by_scene(images: list[tuple[Grey, BoardView]], camera: CameraModel) ->
 
     The pictures may be smaller than the camera's, to which the views' pixels belong.
     """
-    images = images[:_VIEWS]
-    black = np.max([grey for grey, _ in images], axis=0, initial=0) <= _BLACK  # beside straightened pictures
-    cells = [_cells(grey, view, camera, black) for grey, view in images]
+    greys = [grey for grey, _ in images[:_VIEWS]]
+    black = np.max(greys, axis=0, initial=0) <= _BLACK  # beside straightened pictures
+    return _by_tiles(images, camera, black) & _by_tiles(images, camera, np.zeros_like(black))
+
+
+def _by_tiles(images: list[tuple[Grey, BoardView]], camera: CameraModel, black: Array) -> set[Mount]:
+    cells = [_cells(grey, view, camera, black) for grey, view in images[:_VIEWS]]
     told = np.zeros((2, *_TILES))
     for step in (1, 2):
         for (grey, board, middle), (other, its_board, its_middle) in zip(cells, cells[step:], strict=False):

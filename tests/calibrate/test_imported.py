@@ -272,6 +272,8 @@ def test_pairs_of_poses_are_read_as_they_are_meant(
     rows = believe(look(tmp_path), Given(mount="eye-in-hand")).rows
     np.testing.assert_allclose([row.base_from_flange for row in rows], robot, atol=1e-6)
     np.testing.assert_allclose([row.camera_from_board for row in rows], board, atol=1e-6)
+    if len(files := list(tmp_path.iterdir())) == 1:  # the robot's file holds the board's poses, too
+        assert believe(look(tmp_path, files[0]), Given(mount="eye-in-hand")).rows == rows
 
 
 def test_pairs_of_poses_are_a_recording_without_pictures(tmp_path: Path) -> None:

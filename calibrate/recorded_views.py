@@ -13,11 +13,11 @@ import numpy as np
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import pose, rotation_from_rpy
+from calibrate.geometry import Array, pose, rotation_from_rpy
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.kinematics import MODELS, URDF_LINKS, URDF_ORIGIN, RobotModel, table_of_axes
 from calibrate.results import RejectedView
-from calibrate.views import BoardView, ViewSet, require_size
+from calibrate.views import NO_CORNERS, NOMINAL_CAMERA, BoardView, ViewSet, require_size
 from recordings import strict_yaml
 from recordings.errors import BadImageError
 from recordings.files import usable_cores
@@ -98,9 +98,7 @@ def load_views(
             missing.append(RejectedView(view.index, view.name, detection.reason, "corners"))
             continue
         points = board_points(spec)[detection.indices]
-        flange = np.array(view.base_from_flange, dtype=float)
-        joints = None if view.joints_rad is None else np.array(view.joints_rad)
-        views.append(BoardView(view.index, view.name, flange, points, detection.pixels, joints))
+        views.append(_board_view(view, points, detection.pixels))
     if len(views) < fewest:
         raise _too_few(recording, spec, len(views), seen, [*missing, *by_hand], fewest)
     if not (model.width and model.height):
@@ -123,19 +121,14 @@ def _told_views(
             needed=fewest,
             advice="Give more pairs of poses.",
         )
-    poses = np.array([(view.base_from_flange, view.camera_from_board) for view in told], dtype=float)
-    found = ViewSet.from_poses(info.mount, poses[:, 0], poses[:, 1])
-    own = tuple(
-        replace(
-            one,
-            index=view.index,
-            name=view.name,
-            joints_rad=None if view.joints_rad is None else np.array(view.joints_rad),
-        )
-        for one, view in zip(found, told, strict=True)
-    )
-    found = replace(found, views=own, robot_model=info.robot.model, arm=_calibrated_arm(recording))
+    own = tuple(_board_view(view, *NO_CORNERS) for view in told)
+    found = ViewSet(info.mount, own, NOMINAL_CAMERA, info.robot.model, _calibrated_arm(recording))
     return LoadedViews(found, info.board, tuple(by_hand), losses=recording.losses)
+
+
+def _board_view(view: View, points: Array, pixels: Array) -> BoardView:
+    joints, told = (None if of is None else np.array(of) for of in (view.joints_rad, view.camera_from_board))
+    return BoardView(view.index, view.name, np.array(view.base_from_flange), points, pixels, joints, told)
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:

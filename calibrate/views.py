@@ -14,7 +14,9 @@ from calibrate.geometry import Array, inverse
 from calibrate.kinematics import RobotModel
 from recordings.schema.messages import CameraModel, Mount
 
-_NOMINAL_MATRIX = ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0))
+NOMINAL_CAMERA = CameraModel(640, 480, ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0)))
+"""Stands in where no picture shows the board: its poses were told."""
+NO_CORNERS = np.zeros((0, 3)), np.zeros((0, 2))
 
 
 def array_of(values: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
@@ -107,12 +109,11 @@ class ViewSet:
         """Make views without corners from poses (n, 4, 4); a nominal camera stands in for the real one."""
         flange = array_of(base_from_flange, (-1, 4, 4), "base_from_flange")
         boards = array_of(camera_from_board, flange.shape, "camera_from_board")
-        nothing = np.zeros((0, 3)), np.zeros((0, 2))
         views = (
-            BoardView(i, f"view {i}", F, *nothing, camera_from_board=C)
+            BoardView(i, f"view {i}", F, *NO_CORNERS, camera_from_board=C)
             for i, (F, C) in enumerate(zip(flange, boards, strict=True))
         )
-        return cls(mount, tuple(views), CameraModel(640, 480, _NOMINAL_MATRIX))
+        return cls(mount, tuple(views), NOMINAL_CAMERA)
 
     def __len__(self) -> int:
         return len(self.views)

@@ -24,7 +24,7 @@ from calibrate.errors import CalibrationError
 from calibrate.geometry import inverse
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import Candidate, candidate_poses
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import NO_CORNERS, BoardView, ViewSet
 from recordings.errors import ImportSourceError
 from recordings.files import read_file
 from recordings.images import IMAGE_LIMIT_BYTES, ImageError, decode_image, read_header
@@ -74,12 +74,11 @@ class Seen:
 
 def told_boards(table: Table) -> Iterator[Seen]:
     """Every reading of a table of board poses; of an inverted one the solution is the other mounting's."""
-    nothing = np.zeros((0, 3)), np.zeros((0, 2))
     rows = _spread(len(table.numbers), _MOST_ROWS)
     for how, evidence in possible(table.numbers):
         poses = how.poses(table.numbers[rows])
         views: dict[Key, BoardView] = {
-            row: BoardView(row, f"row {row + 1}", np.eye(4), *nothing, camera_from_board=T)
+            row: BoardView(row, f"row {row + 1}", np.eye(4), *NO_CORNERS, camera_from_board=T)
             for row, T in zip(rows, poses, strict=True)
         }
         candidates: dict[Key, list[Candidate]] = {

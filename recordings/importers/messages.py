@@ -180,9 +180,8 @@ def _value(kind: Kind, message: Any, time_ns: int) -> Value:
         positions, speeds = (tuple(map(float, told)) for told in (message.position, message.velocity))
         return JointMessage(stamp_ns, tuple(message.name), positions, speeds)
     if not hasattr(message, "step"):
-        encoding = message.format.partition(";")[
-            0
-        ]  # "bayer_rggb8; png compressed", as image_transport writes
+        # "bayer_rggb8; png compressed", as image_transport writes
+        encoding = message.format.partition(";")[0]
         return ImageMessage(stamp_ns, 0, 0, encoding, 0, bytes(message.data))
     if getattr(message, "is_bigendian", False) and "16" in message.encoding:
         raise ImportSourceError("big-endian")

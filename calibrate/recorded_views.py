@@ -235,7 +235,7 @@ def _too_few(
     advice = "Check the board's kind, columns and rows; solve again with --board to try another."
     if images == 0 and not missing:
         counted = f"{recording.path}: no image has a robot pose"
-        advice = "Images of a sweep have none: record poses with `station capture`."
+        advice = "Record with `station capture`, or import images together with poses."
     elif missing:
         counted += f" (first reason, view {missing[0].index + 1} ({missing[0].name}): {missing[0].reason})"
     return TooFewViewsError(counted=counted, views=found, images=images, needed=fewest, advice=advice)

@@ -113,9 +113,8 @@ def test_leaving_out_a_view_that_shows_no_board_is_fine(source: Recording, tmp_p
     left = load_views(recording, without=(2, 3))
     assert [view.index for view in left.views] == [0, 3, 4, 5, 6, 7]
     assert [(view.index, view.kind) for view in left.without_board] == [(1, "by-hand"), (2, "by-hand")]
-    with raises("too-few-views", TooFewViewsError, views=1) as refused:
+    with raises("too-few-views", TooFewViewsError, views=1):
         load_views(recording, without=tuple(range(1, 8)))
-    assert "--without" in refused.value.text and "sweep" not in refused.value.remedy
     with raises("no-such-view", BadViewsError, views=8):
         load_views(recording, without=(99,))
 
@@ -130,15 +129,14 @@ def test_a_board_declared_in_squares_is_named_with_its_inner_corners(
         load_views(few, squares)
 
 
-def test_a_sweep_of_an_earlier_version_is_refused_by_name(source: Recording, tmp_path: Path) -> None:
-    """It holds images, and no robot pose that belongs to one."""
+def test_pictures_without_poses_are_refused(source: Recording, tmp_path: Path) -> None:
+    """Such as the sweeps of an earlier version."""
     with RecordingWriter(tmp_path / "sweep.mcap", source.info) as writer:
         for _, picture in source.images():
             writer.image(picture)
         path = writer.finish()
-    with raises("too-few-views", TooFewViewsError, views=0) as refused:
+    with raises("too-few-views", TooFewViewsError, views=0):
         load_views(open_recording(path))
-    assert "sweep" in refused.value.remedy
 
 
 def test_a_lost_part_is_never_passed_over(small_session_file: Path, tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ SHIFT_M, TURN_RAD = 0.5e-3, float(np.radians(0.1))
 _MOST_VIEWS = 30
 """Most views suggested for a check; above it, calibrating again costs no more."""
 _SMALLEST_EIGENVALUE = 1e-9
+"""Of the information of camera and board, scaled to ones: below it rounding decides where they are."""
 _LEAST_CORNER_PX = 0.02
 """No corner is found better."""
 

@@ -36,6 +36,7 @@ FALSE_ALARM = 1e-6
 _STILL = np.repeat([0.03e-3, np.radians(0.003)], 3)
 """1σ of the camera's thermal motion in a sound cell; it does not count as a shift."""
 _ROUNDS = 10
+"""Rounds of expectation and maximisation for one test."""
 _MANY = 1e6
 """Degrees of freedom of noise that hundreds of pictures tell."""
 

@@ -109,7 +109,8 @@ def flange_extent(flange: Array) -> Array:
 
 
 _LINKS = 4.0
-"""Errors of the flange as multiples of one link's, as those of all links add up there."""
+"""Errors of the flange as multiples of one link's: five links add up to √5, their levers to about as much
+again. A power of two moves the sizes that are averaged over by whole steps, and X by nothing."""
 
 
 def smooth_motion(flange: Array, extent: Array) -> Array:

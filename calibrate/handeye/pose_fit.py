@@ -26,6 +26,8 @@ from calibrate.views import Places, ViewSet, implied_flange, observe_views
 from recordings.schema.messages import Mount
 
 _SUBSETS, _OF = 120, 4
+"""Subsets, and views in each. Where 45 % of the views are wrong, the four are right in one subset of eleven,
+and in none of 120 once in 100,000 recordings."""
 _VOTERS = 60
 """Most views, evenly spread, that candidates are compared by."""
 _SHARE = 0.55

@@ -68,15 +68,18 @@ class KnownCell:
     """A posterior as arrays: mean and covariance of [X, lens, board shape, errors of arm and bracket]."""
 
     mean: CellState
-    """Its Y and C mean nothing."""
+    """Its Y and C stand for no board: each set of later views has a board pose of its own."""
     covariance: Array
     """(g, g)"""
     scales: Scales
     freedom: float
+    """Degrees of freedom of the noise estimate."""
     extent: Array
     """(2, 2) as `Observations.extent`."""
     chain: Chain | None
+    """The arm as its controller computes it; None: nothing is known of its links' errors."""
     level: Array | None
+    """(3,) mean direction of gravity in the flange over the fit's views; None: no bends are modelled."""
     stated_arm_error: Array = field(default_factory=lambda: np.zeros((6, 6)))
     """(6, 6) as `Posterior.stated_arm_error`."""
     flange_extent: Array | None = None

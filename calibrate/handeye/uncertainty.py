@@ -9,6 +9,7 @@ from scipy.linalg import lapack
 from calibrate.geometry import Array
 
 _ROUNDING = 1e-14
+"""Eigenvalue, of a matrix scaled to ones, that rounding alone may leave of one that is zero."""
 _WELL_DETERMINED = 1e-11
 """Reciprocal condition from which a Cholesky factor inverts a matrix accurately, ten times as fast."""
 

@@ -45,7 +45,7 @@ def _judge(fit: CellFit, places: slice, miss: Array, sigma: Array, distance_m: f
     root = 1.0 / sigma
     left = np.eye(len(sigma)) - covariance[places, places] * root * root[:, None]
     values, vectors = np.linalg.eigh((left + left.T) / 2)
-    told = values > 1e-3
+    told = values > 1e-6  # what is left of smaller ones is rounding
     square = float(((vectors.T @ (miss * root))[told] ** 2 / values[told]).sum())
     sigmas = -float(special.ndtri(special.chdtrc(max(int(told.sum()), 1), square) / 2))
     precision = np.zeros(len(covariance))

@@ -52,10 +52,6 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
     rows.append(facts(("view", str(status.session.captured), f"of {status.session.least_by_hand} or more")))
     if not status.session.check and after_mm is not None and (now_mm is None or after_mm < now_mm):
         rows.append(error_facts("with the next view", after_mm, None))
-    if guidance.warning:
-        rows.insert(0, mark("look", guidance.warning))
-    elif guidance.enough:
-        rows.insert(0, mark("done", "Enough: press F7 to finish"))
     return lines(*rows[:height])
 
 

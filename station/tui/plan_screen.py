@@ -37,13 +37,12 @@ def row_of(pose: PoseStatus, error_mm: float | None) -> tuple[Content, ...]:
     word: str = "saved" if pose.state == "done" else pose.state
     if pose.kept:
         word = "to be captured again"
-    elif pose.state == "failed" and pose.reason:
-        word = f"failed: {pose.reason}"
+    failure = pose.reason if pose.state == "failed" else ""
     return (
         Content.styled(f"{pose.index + 1:>3} ", "$foreground") + mark(kind),
         facts(("", shown, "mm")),
         Content.styled(word, MARKS[kind][1]),
-        Content.styled(pose.why or pose.name, "$foreground"),
+        Content.styled(failure or pose.why or pose.name, "$foreground"),
     )
 
 

@@ -31,7 +31,7 @@ def pose_line(status: StationStatus) -> Content:
         again = sum(pose.kept for pose in status.session.poses)
         return dim(f"{again} to be captured again" if again else "resting")
     if pose.state == "failed":
-        return mark("failed", f"{pose.name}: {pose.reason}")
+        return mark("failed", pose.reason)
     at = list(_STEPS).index(pose.state) if pose.state in _STEPS else (4 if pose.state == "done" else -1)
     parts = []
     for i, word in enumerate(_STEPS.values()):

@@ -44,8 +44,8 @@ def shortened(text: str, cells: int, parts: bool = False) -> str:
 
 
 def sentence(text: str) -> str:
-    """Begin with a capital letter: reasons of errors also stand within others' sentences."""
-    return text[:1].upper() + text[1:]
+    """Write a reason of an error, which also stands within others' sentences, as one of its own."""
+    return text[:1].upper() + text[1:] + "." * text[-1:].isalnum()
 
 
 def mark(kind: Mark, text: str = "") -> Content:

@@ -254,10 +254,12 @@ class UrRobot(UrLink):
         child, self._child, self.control = self._child, None, False
         reply: asyncio.Future[str] | None = None
         try:
-            if child is not None:
-                child.stop()
-            if self.dashboard is not None and self.dashboard.alive:
-                reply = self.dashboard.send(STOP)
+            try:
+                if child is not None:
+                    child.stop()
+            finally:
+                if self.dashboard is not None and self.dashboard.alive:
+                    reply = self.dashboard.send(STOP)
         except Exception:
             log.exception("a path of the stop failed")
         self._later(self._finish_stop(child, reply))  # even if a path failed above

@@ -171,10 +171,12 @@ class Session:
         context, run = self.context, self._run
         self.approvals.void()
         context.requests = RunRequests(halt=True)
-        self.store.enter(state, reason, cause)
-        if run is not None:
-            run.cancel()
-        await self._stop_arm(reason)
+        try:
+            self.store.enter(state, reason, cause)
+        finally:  # a defect in the states must not keep the arm moving
+            if run is not None:
+                run.cancel()
+            await self._stop_arm(reason)
         self.store.event(cause, reason, "warning")
         if run is not None:
             await asyncio.wait({run}, timeout=STOP_WAIT_S)

@@ -88,7 +88,10 @@ async def test_without_control_and_dashboard_a_new_connection_stops_what_runs(ro
 
 @pytest.mark.parametrize(
     ("broken", "reached"),
-    [("send", ["child ends", "child stop", "dashboard anew"]), ("stop", ["child ends", "dashboard anew"])],
+    [
+        ("send", ["child ends", "child stop", "dashboard anew"]),
+        ("stop", ["child ends", "dashboard anew", f"dashboard {STOP}"]),
+    ],
 )
 async def test_a_way_that_breaks_in_the_call_costs_neither_the_other_nor_the_end_of_control(
     robot: Any, ways: Ways, broken: str, reached: list[str]

@@ -8,6 +8,7 @@ import threading
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -42,14 +43,18 @@ class Gate:
         return await self._call(function, *args, timeout_s=timeout_s)
 
 
-async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: Rig) -> None:
-    def fails() -> None:
-        raise ZeroDivisionError("a defect")
-
+async def test_neither_watchers_nor_states_that_fail_come_between_stop_and_the_arm(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fails = Mock(side_effect=ZeroDivisionError("a defect"))
     await rig.go_until_it_moves()
     rig.session.store.watch(fails)
+    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr(rig.session.store, "enter", fails)
+        await rig.session.stop("bert")
+    assert "stop" in rig.arm.log and rig.session._run.cancelling()
     await rig.session.stop("bert")
-    assert rig.state is S.STOPPED and "stop" in rig.arm.log
+    assert rig.state is S.STOPPED
 
 
 async def test_an_offer_does_not_outlive_the_sleep_of_its_computer(rig: Rig, monkeypatch: Any) -> None:

@@ -214,17 +214,12 @@ async def test_a_named_service_approves_by_the_hash_of_plan_and_cell_and_is_writ
 
 
 async def test_a_stop_test_shown_at_a_terminal_is_not_approved_by_the_hash_once_nobody_sees_it(
-    new_rig: NewRig, small_plan: Plan, tmp_path: Path
+    new_rig: NewRig, tmp_path: Path
 ) -> None:
-    terminal = ["pts/3"]
-
-    def see(pid: int) -> Process:
-        return Process(os.getuid(), 77, terminal[0])
-
-    served = await real_cell(new_rig, tmp_path, see, ApprovalConfig(services=(ME,)))
+    served = await real_cell(new_rig, tmp_path, at_a_terminal, ApprovalConfig(services=(ME,)))
     async with await served.client() as anna:
         offer = await anna.request("prepare", stop_test=STOP_TEST)
-        terminal[0] = ""
+        served.dispatcher._rule._see = with_none
         with raises("no-terminal"):
             await anna.request("go", token=offer["token"], approval_sha256=offer["approval_sha256"])
     assert "start control" not in served.rig.arm.log

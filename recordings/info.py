@@ -50,9 +50,9 @@ class RecordingInfo(msgspec.Struct, frozen=True):
     size_bytes: int
     sha256: str
     poses: int
-    """That count."""
+    """Poses with a view that counts."""
     attempts: int
-    """Views of them and of those that were taken back, retakes included."""
+    """All views: retakes and those that were taken back, too."""
     taken_back: int
     topics: list[TopicInfo]
     """Ours first."""

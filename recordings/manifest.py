@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from recordings.errors import CorruptRecordingError, RecordingError, disk_error
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, open_file, write_atomically
+from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, read_beginning, write_atomically
 
 MANIFEST_FILE = "parts.json"
 PARTS_LIMIT = 100
@@ -39,13 +39,10 @@ def read_manifest(folder: Path) -> Manifest | None:
     path = folder / MANIFEST_FILE
     if not os.path.lexists(path):
         return None
-    descriptor = open_file(path)
     try:
-        content = os.pread(descriptor, _LIMIT_BYTES, 0)
+        content = read_beginning(path, _LIMIT_BYTES)
     except OSError as error:
         raise disk_error("read", path, error) from error
-    finally:
-        os.close(descriptor)
     try:
         manifest = msgspec.json.decode(content, type=Manifest)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

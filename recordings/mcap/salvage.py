@@ -1,6 +1,6 @@
 """Finds what is whole in a cut or damaged file: chunks, attachments and metadata with their checksums.
 
-Nothing that no checksum vouches for is kept. After a damaged place the search goes on at the next record that
+Only what a checksum proves is kept. After a damaged place the search goes on at the next record that
 is whole.
 """
 

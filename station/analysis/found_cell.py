@@ -1,6 +1,6 @@
 """The cell by views so far: camera and board pose, a rough lens, and what is probably wrong.
 
-Which answer of a new cell, which told pose, or which way of reading all poses.
+Wrong may be an answer given for a new cell, one told pose, or the way in which all poses are read.
 """
 
 from __future__ import annotations

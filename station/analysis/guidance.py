@@ -39,7 +39,7 @@ USUAL_FOCAL = 1.3
 NEW_RAD, NEW_SHARE = math.radians(10.0), 0.12
 """Turn of the board, and shift of its middle as a share of its distance, by which a view is new."""
 _OTHER = 2.0
-"""As many times further from a view that was given up."""
+"""Least distance from a view that was given up, as a multiple of what makes a view new."""
 _TILT_RAD, _ROLL_RAD = math.radians(42.0), math.radians(90.0)
 """Largest tilt of the board, and largest roll against the first view, that are asked for."""
 _FURTHER_RAD, _WIDER = math.radians(40.0), 1.25

@@ -19,12 +19,14 @@ from station.cell.limits import joint_bounds
 from station.plan.order import move_times
 from station.plan.visibility import ViewRange, seen_for_certain, sees_past_the_arm
 
+# Names of limits, as people read them.
 NOT_IN_PICTURE = "the whole board is not in the image"
 OUT_OF_REACH = "the arm's reach"
 ARM_IN_SIGHT = "the arm itself, between camera and board"
 _PATH_RESERVE_M = 0.01
 """Clearance of poses beyond every limit, so that moves between neighbours have room."""
 _HUBS = 6
+"""Postures tried as hub of a group: it holds what the arm reaches from there by a free direct move."""
 _NEARLY_ALL = 0.85
 """Share of the branch that a group must hold for the search of a better hub to end."""
 _REACH_RAD = 2.6

@@ -15,7 +15,11 @@ from station.cell.limits import leading_speed, leaving, trapezoid
 _SAMPLES = (9, 33, 129)
 """Numbers of samples along a move, tried in this order until the result is certain."""
 BLOCKED = np.inf
-_NEAR_STARTS, _OTHER_STARTS, _LONG_TOUR = 8, 4, 60
+"""Duration of a move that violates a limit."""
+_NEAR_STARTS, _OTHER_STARTS = 8, 4
+"""Tours that begin near the arm, and elsewhere: each is improved, and the shortest counts."""
+_LONG_TOUR = 60
+"""Number of poses above which no single pieces of a tour are moved, as there are too many ways."""
 
 
 def move_times(geometry: CellGeometry, joints_from: Array, joints_to: Array) -> Array:

@@ -129,7 +129,7 @@ def test_a_damaged_list_is_refused(session: Path, content: bytes) -> None:
 def test_a_list_that_is_no_file_does_not_hang_its_reader(session: Path) -> None:
     (session / MANIFEST_FILE).unlink()
     os.mkfifo(session / MANIFEST_FILE)
-    with refused("no-file"):
+    with refused("disk"):
         open_recording(session)
 
 

@@ -77,7 +77,7 @@ Profile = Trapezoid | Braking
 
 
 class JointMotion:
-    """One way to joints, all together, each in proportion to its own. `done` once it rests at its end.
+    """A straight move in joint space: all joints begin and end together. `done` once it rests at its end.
 
     Its parameter `s` is the leading joint's angle [rad], from 0.
     """

@@ -40,7 +40,7 @@ class InterpretedProgram:
         self._mover: Thread | None = None
         """The thread that controls the arm."""
         self._orphan: JointMotion | None = None
-        """A motion that no thread waits for any more: for whoever moves or stops in the same cycle."""
+        """Motion of a killed thread: another may move or stop in the same cycle, else the arm brakes."""
         counted = {name: self._counted(name) for name in REFUSED} | {
             name: self._counted(name, lambda *_: None)
             for name in ("force_mode_set_damping", "force_mode_set_gain_scaling")

@@ -65,7 +65,7 @@ class Clock:
         for left in reversed(range(min(behind, CHUNK))):
             self.count += 1
             due_ns = self.due_ns(self.count)
-            self._tick(due_ns, late and left > 0)  # together they last one cycle for whoever counts
+            self._tick(due_ns, late and left > 0)  # to program and watchdog they are one cycle
 
 
 class Machine:

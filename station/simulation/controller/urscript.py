@@ -114,7 +114,7 @@ def _kill(thread: Value) -> None:
 
 
 class List(list[Value]):
-    """No operator takes it here."""
+    """A list: this interpreter has no arithmetic of lists."""
 
     __add__ = __iadd__ = __mul__ = __rmul__ = __imul__ = None  # type: ignore[assignment]
 

@@ -29,15 +29,15 @@ def test_a_line_of_the_table_opens_its_commands_help(name: str) -> None:
 
 @pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
 def test_help_fits_on_a_small_terminal_and_all_lists_every_command(program: str) -> None:
-    def told(option: str) -> list[str]:
+    shown = {}
+    for option in ("--help", "--all"):
         command = [sys.executable, "-m", f"{program}.cli", option]
         small = {**os.environ, "COLUMNS": "80"}
         done = subprocess.run(command, capture_output=True, text=True, check=True, env=small)
-        return done.stdout.splitlines()
-
+        shown[option] = done.stdout.splitlines()
     group: LazyGroup = getattr(importlib.import_module(f"{program}.cli.app"), program.upper())
     common = {name for name, command in group._lazy.items() if not command.rare}
     for option, names in (("--help", common), ("--all", set(group.commands))):
-        assert {line.split()[1] for line in told(option) if line.startswith("│")} >= names
-    assert len(told("--help")) < 24
-    assert not any(f"│ {name} " in line for name in set(group.commands) - common for line in told("--help"))
+        assert {line.split()[1] for line in shown[option] if line.startswith("│")} >= names
+    assert len(shown["--help"]) < 24
+    assert not any(f"│ {name} " in line for name in set(group.commands) - common for line in shown["--help"])

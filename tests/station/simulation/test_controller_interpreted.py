@@ -18,9 +18,6 @@ GO = f"  thread go():\n    movej({GOAL}, a=1.0, v=0.5)\n  end\n  h = run go()\n{
 """A thread moves the arm, and is half-way."""
 
 
-# -- moves ----------------------------------------------------------------------------------------------
-
-
 # -- stops and errors -----------------------------------------------------------------------------------
 
 
@@ -28,7 +25,7 @@ GO = f"  thread go():\n    movej({GOAL}, a=1.0, v=0.5)\n  end\n  h = run go()\n{
 def test_a_killed_thread_leaves_the_arm_to_whoever_stops_it_else_it_stops_suddenly(
     started, then: str, limit_s: float
 ) -> None:
-    made = started(f"{GO}  kill h\n  {then}")
+    made = started(f"{GO}  kill h\n  kill h\n  kill 0\n  {then}")  # 0: where none was started yet
     made.run_until(lambda: made.speed_rad_s > 0.45)
     made.run_until(lambda: made.speed_rad_s < 0.45)
     took = made.run_until(lambda: made.speed_rad_s == 0.0)

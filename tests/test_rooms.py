@@ -13,7 +13,8 @@ from pathlib import Path
 import grimp
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from tests.test_error_tables import ROOT, trees
+
 HEAVY = ("numpy", "cv2", "matplotlib", "google", "mcap_protobuf", "scipy", "rosbags")
 SCREEN = ("numpy", "scipy", "cv2", "textual", "calibrate")
 HARDWARE = ("textual", "serial", "rtde_control", "gi")
@@ -119,18 +120,17 @@ _READERS = {"read_text", "read_bytes", "imread", "memmap", "loadtxt", "genfromtx
 def test_files_of_people_are_opened_by_one_function() -> None:
     """`recordings.files.open_regular` opens at once, or not at all; anything else may wait for ever."""
     found = set()
-    for room in ("recordings", "calibrate", "station"):
-        for path in (ROOT / room).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_bytes())):
-                if not isinstance(node, ast.Call):
-                    continue
-                match node.func:
-                    case ast.Name("open") | ast.Attribute(ast.Name("np"), "load"):
-                        found.add(path)
-                    case ast.Attribute(_, name) if name in _READERS:
-                        found.add(path)
-                    case ast.Attribute(_, "open") if _is_mode(node.args[:1]):
-                        found.add(path)
+    for path, tree in trees().items():
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Call):
+                continue
+            match node.func:
+                case ast.Name("open") | ast.Attribute(ast.Name("np"), "load"):
+                    found.add(path)
+                case ast.Attribute(_, name) if name in _READERS:
+                    found.add(path)
+                case ast.Attribute(_, "open") if _is_mode(node.args[:1]):
+                    found.add(path)
     assert {path.relative_to(ROOT).as_posix() for path in found} <= READ_DIRECTLY
 
 

@@ -6,39 +6,37 @@ import ast
 import re
 import shlex
 from collections.abc import Iterator
-from pathlib import Path
 
 import typer
 
 from recordings.errors import error_table
+from tests.test_error_tables import ROOT, trees
 from tests.test_examples import PROGRAMS
 
-ROOT = Path(__file__).parents[1]
 _COMMAND = re.compile(r"`((?:station|calibrate|recordings)(?: [^`]*)?)`")
 
 
 def suggested() -> Iterator[tuple[str, str]]:
     """(where, command) of every quoted command in a text that is no docstring; what is filled in reads X."""
+    for path, tree in trees().items():
+        docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        inside = {
+            id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values
+        }
+        for node in ast.walk(tree):
+            if id(node) in docs or id(node) in inside:
+                continue
+            if isinstance(node, ast.JoinedStr):
+                text = "".join(
+                    str(part.value) if isinstance(part, ast.Constant) else "X" for part in node.values
+                )
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                text = node.value
+            else:
+                continue
+            for command in _COMMAND.findall(text):
+                yield f"{path.relative_to(ROOT)}:{node.lineno}", command
     for package in PROGRAMS:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            tree = ast.parse(path.read_text())
-            docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-            inside = {
-                id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values
-            }
-            for node in ast.walk(tree):
-                if id(node) in docs or id(node) in inside:
-                    continue
-                if isinstance(node, ast.JoinedStr):
-                    text = "".join(
-                        str(part.value) if isinstance(part, ast.Constant) else "X" for part in node.values
-                    )
-                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                    text = node.value
-                else:
-                    continue
-                for command in _COMMAND.findall(text):
-                    yield f"{path.relative_to(ROOT)}:{node.lineno}", command
         for code, entry in error_table(package).items():
             for command in _COMMAND.findall(re.sub("{.*?}", "X", f"{entry['text']} {entry.get('remedy')}")):
                 yield f"{package}/errors.toml [{code}]", command

@@ -146,7 +146,7 @@ class StationApp(LivePageApp[None], DaemonApp):
             self.look_at_disk()
         if before is not None and status.session.name not in ("", before.session.name):
             self.result_path = ""  # another session began: what was looked at is no part of it
-        elif self.known.by_hand and before is not None and _one_more(before.session, status.session):
+        elif self.known.hand_guided and before is not None and _one_more(before.session, status.session):
             self.bell()
         if before is None:  # connected, perhaps to another daemon than before
             self.known = replace(self.known, configuration=self.link.client.config)
@@ -256,7 +256,7 @@ class StationApp(LivePageApp[None], DaemonApp):
         """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
         if (status := self.known.live) is None:
             return
-        begins = not self.known.by_hand
+        begins = not self.known.hand_guided
         if not begins and status.state in RUNNING:  # ends after the view that is being taken
             await self.link.ask(verbs.Pause())
         elif await self.link.ask(verbs.Freedrive(begins)) is not None and begins:

@@ -51,7 +51,7 @@ class CaptureScreen(StationScreen):
 
     def show(self, known: Known) -> None:
         status, session = known.shown, known.shown.session
-        by_hand = known.by_hand
+        by_hand = known.hand_guided
         progress = self.query_one("#progress", Panel)
         progress.border_subtitle = BACK if by_hand else LEGEND
         self.query_one(PreviewPane).wanted = status.guidance.outline

@@ -263,7 +263,7 @@ class Framed(Screen[R]):
             shown, action = active.binding, active.binding.action
             if not self.does_something(action):
                 keys[key] = active._replace(binding=replace(shown, show=False))
-            elif action == "freedrive" and self.known.by_hand:
+            elif action == "freedrive" and self.known.hand_guided:
                 keys[key] = active._replace(binding=replace(shown, description="End freedrive"))
         return keys
 
@@ -272,7 +272,7 @@ class Framed(Screen[R]):
         verb, status = ASKS.get(action), self.known.shown
         if verb is not None and self.known.old:
             return False
-        if action == "freedrive" and self.known.by_hand:
+        if action == "freedrive" and self.known.hand_guided:
             return True
         if verb is not None and (status.state not in verb.states or (verb.moves and status.robot.by_hand)):
             return False

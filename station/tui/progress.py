@@ -55,7 +55,7 @@ def pose_under_way(status: StationStatus) -> PoseStatus | None:
 def progress_lines(known: Known, width: int, height: int) -> Content:
     """Draw how many poses are saved, the steps of the present one, and a chip for each; by hand the guide."""
     status = known.shown
-    if known.by_hand:
+    if known.hand_guided:
         return hand_lines(known, width, height)
     session, pose = status.session, pose_under_way(status)
     if not session.poses:

@@ -87,7 +87,7 @@ class Known:
         return bool(self.gone) or self.silent_s is not None
 
     @property
-    def by_hand(self) -> bool:
+    def hand_guided(self) -> bool:
         """Views are taken by hand, also while one is being saved."""
         return self.shown.state is StationState.FREE_DRIVE or bool(self.shown.guidance.outline)
 
@@ -161,7 +161,7 @@ def _capture(known: Known, status: StationStatus) -> Step:
     brief = f"{session.captured}/{len(session.poses)}"
     if state in (StationState.STOPPED, StationState.FAULT):
         return Step("capture", "stopped", f"{state.value} at {count}", brief)
-    if known.by_hand:
+    if known.hand_guided:
         return Step("capture", "now", f"{many(session.captured, 'view')} by hand", str(session.captured))
     if not session.poses:
         return Step("capture", "todo", "not begun" if status.robot.by_hand else "after plan")

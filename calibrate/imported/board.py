@@ -172,14 +172,12 @@ def _likely(
         board = each if known else msgspec.structs.replace(each, square_m=GUESSED_M)
         progress(n, n + 1, f"trying a {board.kind.value} {board.columns}×{board.rows}")
         part = any(
-            (shown is not None and not knew and board.kind is larger.kind)
+            (shown is not None and not knew and board.kind is larger.kind is not BoardKind.CHESSBOARD)
             and (board.columns <= larger.columns and board.rows <= larger.rows)
             for _, larger, knew in counted
-        )  # of circles that one image shows whole; a part of a chessboard is not found
+        )  # of circles that one image shows whole; `detect` itself takes no part of a chessboard
         try:
-            if part and board.kind is not BoardKind.CHESSBOARD:
-                continue
-            if shown is not None and not detect(shown, board, True, False).found:
+            if part or (shown is not None and not detect(shown, board, True, False).found):
                 continue
             seen = [detect(image, board, False) for image in images]
         except CalibrationError:

@@ -97,8 +97,8 @@ def believe(
             progress(n, len(boards), "comparing tables of poses")
             tried += table_readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
     if not tried and (seen or not families):
-        there = [f"{len(paths)} {name}" for name, paths in held.images.items()]
-        there += [f"{name}, {todo}" for name, todo in held.unread.items()]
+        there = [f"{name}, {todo}" for name, todo in held.unread.items()]
+        there += [f"{len(paths)} {name}" for name, paths in held.images.items()]
         tables = [f"{len(table.numbers)} {table.name}" for table in held.tables]
         said = [", ".join(each[:8]) or "none" for each in (there, tables)]
         raise ImportSourceError("no-pairs", source=held.root, images=said[0], tables=said[1])

@@ -81,9 +81,12 @@ class ConfirmMotion(Confirm):
         self._count_down()
 
     def show(self, known: Known) -> None:
-        """Close where STOP, a fault or the daemon's end made an answer useless."""
+        """Close where STOP, a fault or the daemon's end made an answer useless.
+
+        Below the command palette only once that is closed: Textual would close the palette instead.
+        """
         super().show(known)
-        if known.live is None or known.live.state not in Go.states:
+        if self.is_active and (known.live is None or known.live.state not in Go.states):
             self.dismiss(False)
 
     def _count_down(self) -> None:
@@ -94,7 +97,7 @@ class ConfirmMotion(Confirm):
         line += limit_bar(left_s, APPROVAL_LIFETIME_S, 24, "$warn", 1.0)
         asked = Content.styled("▲ Is everybody out of the arm's reach?", "bold $warn")
         self.query_one("#motion-holds", Static).update(lines(asked, line))
-        if not left_s:
+        if not left_s and self.is_active:
             self.notify("The question expired: nothing moved. F5 asks again.", severity="warning")
             self.dismiss(False)
 
@@ -197,7 +200,7 @@ class JobScreen(Question[int]):
             self.said.append(line.decode(errors="replace").rstrip())
             lines.write(self.said[-1])
         self._exit_code = await self._process.wait()
-        if self._ended or self._exit_code in self._close_on:
+        if self.is_active and (self._ended or self._exit_code in self._close_on):
             self.dismiss(self._exit_code if self._exit_code in self._close_on else -1)
             return
         self.query_one("#job-title", Label).update(self._title)

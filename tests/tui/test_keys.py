@@ -51,6 +51,28 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
         await until(pilot, lambda: pilot.app.current_mode == "capture")  # where the work is watched
 
 
+@pytest.mark.parametrize("why", ["STOP", "expired"])
+async def test_a_question_below_the_palette_closes_once_the_palette_is_closed(
+    link: FakeLink, why: str
+) -> None:
+    async with opened(link, notifications=True) as pilot:
+        await pilot.press("f5")
+        await until(pilot, lambda: pilot.app.screen.query("#yes"))
+        question = pilot.app.screen
+        await pilot.press("ctrl+p")
+        await until(pilot, lambda: pilot.app.screen is not question)
+        for reason in ("STOP by ben", "STOP by anna"):  # each is drawn
+            link.show(idle(StationState.STOPPED, reason) if why == "STOP" else idle(reason=reason))
+            await until(pilot, lambda reason=reason: question.known.shown.reason == reason)
+            question._until_s = 0.0 if why == "expired" else question._until_s
+            question._count_down()
+            await pilot.pause()
+        assert pilot.app.screen is not question and question in pilot.app.screen_stack
+        await pilot.press("escape")
+        await until(pilot, lambda: question not in pilot.app.screen_stack)
+        assert "go" not in link.verbs
+
+
 async def test_a_key_sends_its_wish_at_once_and_a_refusal_is_said(link: FakeLink) -> None:
     wishes = {"f6": ["pause"], "f8": ["acknowledge"], "f3": ["free_drive"], "f2": ["record"], "f12": ["stop"]}
     link.refuse["prepare"] = RefusedError("control-held", holder="anna on tty1")

@@ -80,11 +80,15 @@ async def test_a_dashboard_that_does_not_answer_is_asked_by_a_new_connection(rob
     assert sorted(ways.log[2:]) == ["child ends", "dashboard anew"]
 
 
-async def test_without_control_and_dashboard_a_new_connection_stops_what_runs(robot: Any, ways: Ways) -> None:
-    robot._child, ways.alive = None, False
+@pytest.mark.parametrize("alive", [True, False])
+async def test_without_control_of_ours_the_dashboard_stops_what_runs(
+    robot: Any, ways: Ways, alive: bool
+) -> None:
+    robot._child, ways.alive = None, alive
+    ways.reply.set_result("Stopped")
     await robot.stop("STOP by anna")
     await robot.idle()
-    assert ways.log == ["dashboard anew"]
+    assert ways.log == [f"dashboard {STOP}" if alive else "dashboard anew"]
 
 
 @pytest.mark.parametrize("broken", ["send", "stop"])

@@ -114,6 +114,22 @@ async def test_poses_of_a_check_are_planned_for_a_known_lens(
     assert asked == [True, False]
 
 
+@pytest.mark.parametrize("how", ["disconnects", "its terminal does not answer"])
+async def test_the_arm_of_a_lost_client_is_stopped(served: Served, small_plan: Plan, how: str) -> None:
+    store = served.rig.session.store
+    async with await served.client() as anna:
+        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        served.rig.arm.slow = True
+        offer = await anna.request("prepare")
+        await anna.request("go", token=offer["token"])
+        await served.rig.until(StationState.MOVING)
+        if how != "disconnects":
+            await anna.request("release", silent=True)
+            assert "terminal" in store.status.reason
+    await served.rig.until(StationState.PAUSED)
+    assert served.rig.cause == "control-lost" and store.status.lease.client_id is None
+
+
 @pytest.mark.parametrize(
     ("verb", "args"),
     [

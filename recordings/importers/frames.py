@@ -126,9 +126,9 @@ class FrameTree:
         return not self.edges[pair].latched and bool(np.ptp(table, axis=0).max() > 0)
 
     def track(self, base: str, flange: str) -> Track:
-        """base_from_flange over time. ImportSourceError when no chain is there, or nothing of it moves."""
+        """base_from_flange over time. ImportSourceError when a chain is not there."""
         path = self.chain(base, flange)
-        if not any(self.moves(pair) for pair, _ in path):
+        if not path:
             raise self._no_chain(base, flange)
         links = [_Link(*self.edges[pair].sorted(), forward, self.moves(pair)) for pair, forward in path]
         return Track(links)

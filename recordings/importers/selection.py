@@ -74,6 +74,8 @@ def select(bag: Bag, wanted: Wanted) -> Selection:
         if len(tree.edges) != 1:
             raise ImportSourceError("several-frames", topic=topic)
         ((base, flange),) = tree.edges
+        if not tree.moves((base, flange)):
+            raise ImportSourceError("no-frames", base=base, flange=flange, frames=topic)
         said = f"poses on {topic} in {base}"
     else:
         tree = _tree(bag, [topic.name for topic in frames])

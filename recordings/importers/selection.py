@@ -74,6 +74,7 @@ def select(bag: Bag, wanted: Wanted) -> Selection:
         if len(tree.edges) != 1:
             raise ImportSourceError("several-frames", topic=topic)
         ((base, flange),) = tree.edges
+        tree.find(base, flange)  # a topic that stands still is no arm's
         if not tree.moves((base, flange)):
             raise ImportSourceError("no-frames", base=base, flange=flange, frames=topic)
         said = f"poses on {topic} in {base}"

@@ -192,7 +192,7 @@ class Posterior(msgspec.Struct, frozen=True, omit_defaults=True):
     class_shares: list[float]
     """Of ordinary, 3 and 10 times as noisy, and useless views."""
     freedom: float
-    """Degrees of freedom of the noise estimate."""
+    """ν of F(6, ν), by which a check has its limit: of the noise, fewer by unknown sizes of errors."""
     board_extent_m: tuple[tuple[float, ...], ...]
     """Middle and half size of the corners seen, to which the bends of `shape` refer."""
     arm: LearnedArm | None = None

@@ -90,6 +90,11 @@ class Estimate:
 
         return float(optimize.brentq(outside, 0.9 * one * ratio.min(), 1.1 * one * ratio.max()))
 
+    @property
+    def freedom_of_region(self) -> float:
+        """ν of the F(6, ν) that has this `threshold`: below `freedom` by a mixture's heavier tails."""
+        return min(self.freedom, float(special.fdtridfd(6, 0.95, self.threshold / 6)))
+
 
 def estimate(
     observed: Observations,

@@ -51,7 +51,7 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
         robot_noise=tuple(scales.robot.tolist()),
         corner_noise_px=(scales.tau_px, scales.lambda_px, scales.sigma_px),
         class_shares=scales.shares.tolist(),
-        freedom=found.freedom,
+        freedom=found.freedom_of_region,
         board_extent_m=as_rows(fit.observed.extent),
         arm=None if chain is None else chain.plain,
         stated_arm_error=as_rows(stated_arm_error) if stated_arm_error.any() else None,
@@ -73,7 +73,7 @@ class KnownCell:
     """(g, g)"""
     scales: Scales
     freedom: float
-    """Degrees of freedom of the noise estimate."""
+    """Degrees of freedom ν of F(6, ν), by which a test has its limit."""
     extent: Array
     """(2, 2) as `Observations.extent`."""
     chain: Chain | None

@@ -110,6 +110,8 @@ def test_errors_of_an_arm_that_nobody_described_are_no_shift(mount: Mount) -> No
         views = later_views(cell, np.zeros(6), 0, 6)
         still = find_shift(views, known)
         assert still.arm_known and still.p_value > 1e-3
+        # as heavy tails as the fit's region, which is an average over sizes of errors
+        assert still.threshold == pytest.approx(solution.confidence_threshold) and known.freedom < 60
         assert not find_shift(later_views(cell, np.r_[1e-3, 0, 0, 0, 0, 0], 0, 6), known).passed
     assert _with_joints(views, known, np.degrees).statistic == pytest.approx(still.statistic, rel=1e-6)
     assert not _with_joints(views, known, lambda q: 1.1 * q).arm_known, "not this arm's"

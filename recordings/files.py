@@ -184,10 +184,16 @@ def usable_cores() -> int:
 
 
 def state_root(root: Path | str | None = None) -> Path:
-    """State folder of the station: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder."""
+    """State folder of the station: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder.
+
+    Raises RecordingError (`no-home`).
+    """
     if root is not None:
         return Path(root)
     if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
         return Path(state)
-    base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    try:
+        base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    except RuntimeError:  # an account of a container: no $HOME, no line in /etc/passwd
+        raise RecordingError("no-home") from None
     return Path(base) / "calibration-station"

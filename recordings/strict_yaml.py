@@ -69,12 +69,12 @@ for _tag, _pattern in (
     ("null", r"~|null|Null|NULL|"),
     ("bool", r"true|True|TRUE|false|False|FALSE"),
     ("int", _WHOLE),
-    ("float", rf"({_WHOLE}|[-+]?([0-9]+\.[0-9]*|\.[0-9]+))([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan"),
+    ("float", rf"({_WHOLE}|[-+]?([0-9]+\.[0-9]*|\.[0-9]+))([eE][-+]?[0-9]+)?|(?i:[-+]?\.inf|\.nan)"),
 ):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), None)
 _Loader.add_constructor(
     "tag:yaml.org,2002:float",
-    lambda _, node: float(node.value.replace(".inf", "inf").replace(".nan", "nan")),
+    lambda _, node: float(node.value.lower().replace(".inf", "inf").replace(".nan", "nan")),
 )
 
 

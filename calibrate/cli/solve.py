@@ -105,7 +105,7 @@ def solve(
         robot_accuracy_m=None if robot_accuracy_mm is None else robot_accuracy_mm / 1000,
         robot_accuracy_rad=None if robot_accuracy_deg is None else math.radians(robot_accuracy_deg),
     )
-    name = recording.resolve().name  # `.` has none
+    name = Path(os.path.abspath(recording)).name  # noqa: PTH100  (`.` has none, and a link keeps its own)
     target = output or Path(f"{name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target, "calibration")
     if opened and report is None:

@@ -141,7 +141,8 @@ def look(source: Path, poses: Path | None = None) -> Contents:
                 told[key].append(_Row(numbers, node.image, place, file in (path, *path.parents)))
         for (named, *form), each in told.items():  # files of one row each make a table together
             rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
-    found.words = " ".join(re.sub("[- ]", "_", word) for word in dict.fromkeys(words))
+    words += [re.sub("[- ]", "_", word) for word in words]
+    found.words = " ".join(dict.fromkeys(words))
     for name, rotation, each in _joined(rows):
         for part, some in _two_by_two(each).items():
             table = _without_count(np.array([row.numbers for row in some]))

@@ -141,6 +141,9 @@ def test_distances_of_camera_and_board_contradict_but_do_not_tell_the_mounting_a
     np.testing.assert_allclose([row.base_from_flange for row in found.rows], images[1], atol=1e-6)
     with raises("which-mount"):
         believe(look(folder), Given(mount="eye-to-hand"))
+    (folder / "rig-eih.txt").write_text("of a camera in hand")
+    assert believe(look(folder)).dataset.mount == "eye-in-hand"
+    (folder / "rig-eih.txt").unlink()
     (folder / "eye_to_hand.txt").write_text("of a fixed camera")
     with raises("which-mount"):
         believe(look(folder))

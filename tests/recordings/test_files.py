@@ -20,6 +20,7 @@ from recordings.files import (
     is_session_name,
     require_free_space,
     session_name_from,
+    state_root,
     write_atomically,
 )
 from recordings.reader import open_recording
@@ -161,3 +162,14 @@ def test_a_file_that_was_asked_for_has_its_owners_permissions(tmp_path: Path) ->
         os.umask(before)
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
     assert modes == {"ours.json": 0o640, "theirs.yaml": 0o664}
+
+
+def test_an_account_without_a_home_is_told_to_name_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("HOME", "XDG_STATE_HOME", "STATE_DIRECTORY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    with refused("no-home"):
+        state_root()
+    assert state_root(tmp_path) == tmp_path

@@ -45,6 +45,7 @@ def test_numbers_and_words_mean_what_they_look_like() -> None:
     assert outer.inner == Inner(0.001, "no")
     assert outer.point_m == (1.0, 2.5, -0.5)
     assert load_plain(b"[1e-05, -2E3, 0012.5, 12:30:45, True]") == [1e-05, -2000, 12.5, "12:30:45", True]
+    assert load_plain(b"[.Inf, -.Inf, .Nan, .NaN]")[:2] == [math.inf, -math.inf], "as OpenCV writes them"
     texts = ["0128", "010", "no", "True", "~", "1e-3x"]
     assert load_plain(yaml.safe_dump(texts).encode()) == texts
 

@@ -224,6 +224,8 @@ def test_simulated_never_installs_on_a_real_cell(small_session_file: Path, tmp_p
     shutil.copy(small_session_file, tmp_path)
     run("solve", ".", cwd=tmp_path)
     made = f"{tmp_path.name}.calibration.yaml"
+    (tmp_path / "newest").symlink_to(tmp_path)
+    assert "newest.calibration.yaml" in run("solve", "newest", cwd=tmp_path).stdout
     refused(run("install", made, "--override", "x", cwd=tmp_path), 1, "other-cell")
     refused(run("install", made, "--cell", "simulated", cwd=tmp_path), 2, "root-missing", "--root")
     assert not list((tmp_path / "state").rglob("*.yaml")), "the real cell's place is untouched"

@@ -2,9 +2,17 @@
 
 A gate is, under one name, a limit in `GateLimits`, whose text says when it closes, and a figure that
 `_measured` yields of the solution, with title, unit and remedy. Terminal, screen, report, `--json`, the file
-of limits and docs/reference/gates.md take all gates from here. A new figure is a field of
-`handeye.solution.Solution`, filled in `handeye.solve`, for the default profile and the paper's. A gate
-without a value has a function of its own that `judge` calls, such as `_session_gate`.
+of limits and docs/reference/gates.md (`make pages`) take all gates from here.
+
+To add one:
+  1. Compute the figure in `handeye/metrics.py`; test it in tests/calibrate/handeye/test_metrics.py.
+  2. The solver sees no pictures: a figure of a picture is first a field of `views.BoardView`, filled in
+     `recorded_views.py` (of a recording) and `pictures.py` (of pictures that a program gives).
+  3. Make it a field of `handeye.solution.Solution`, filled in `handeye/solve.py` twice: in `_describe` for
+     the default profile, in `solve_paper_profile` for the paper's.
+  4. Here add its limit and its figure; `unit` is a key of `results.UNITS_SHOWN`. A gate without a value has
+     a function of its own that `judge` calls, such as `_session_gate`.
+  5. In tests/calibrate/test_gates.py put a good value into the fixture `solution`, a bad one into `spoiled`.
 """
 
 from __future__ import annotations
@@ -89,7 +97,7 @@ class _Figure(NamedTuple):
     """What is measured, for people."""
     sense: Sense
     unit: str
-    """Of value and limit: m, deg, s, px, share; empty for plain numbers."""
+    """Of value and limit, a key of `results.UNITS_SHOWN`: m, deg, s, px, share; empty for plain numbers."""
     remedy: str
     """Next step where the gate is closed."""
 
@@ -120,17 +128,13 @@ def _measured(solution: Solution, clock_bound_s: float | None) -> Iterator[_Figu
         yield _Figure("view_rms_px", px[worst], title, "≤", "px", remedy)
     if solution.holdout is not None and distance_m:
         missed_m = solution.holdout.e_t_m
-        title, remedy = (
-            f"Held-out error ({1e3 * missed_m:.2g} mm)",
-            "Check robot accuracy and corner detection.",
-        )
+        title = f"Held-out error ({1e3 * missed_m:.2g} mm)"
+        remedy = "Check robot accuracy and corner detection."
         yield _Figure("holdout_share", missed_m / distance_m, title, "≤", "share", remedy)
     if folds is not None:
         figures = f"({folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm; 1 is what chance explains)"
-        ratio, remedy = (
-            folds.rms_mm / folds.claimed_mm / folds.limit,
-            "Check intrinsics, board and looseness of the mounts.",
-        )
+        ratio = folds.rms_mm / folds.claimed_mm / folds.limit
+        remedy = "Check intrinsics, board and looseness of the mounts."
         yield _Figure("cross_validation", ratio, f"Cross-validated error {figures}", "≤", "", remedy)
     title = f"Predicted error at {distance_m * 1e3:.0f} mm"
     remedy = f"Least known: {seen.weakest_text}. Add rotations about that direction."

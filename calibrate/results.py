@@ -20,7 +20,7 @@ class Remark:
 
 
 Sense = Literal["≥", "≤"]
-_SHOWN = {
+UNITS_SHOWN = {
     "m": (1e3, " mm"),
     "deg": (1.0, "°"),
     "s": (1e3, " ms"),
@@ -28,7 +28,7 @@ _SHOWN = {
     "share": (100.0, " %"),
     "": (1.0, ""),
 }
-"""Stored unit → factor and unit shown to people."""
+"""Unit of a gate's figure as stored → factor to the unit that people see, and that unit."""
 _NARROW = 0.1
 
 
@@ -57,14 +57,14 @@ class Gate(msgspec.Struct, frozen=True):
         """Judge `value` against `limit` and make the gate's text."""
         passed = bool(np.isfinite(value) and (value >= limit if sense == "≥" else value <= limit))
         gate = cls(name, passed, float(value), float(limit), "", unit, "" if passed else remedy, sense)
-        limit_unit = _SHOWN[unit][1] if _SHOWN[unit][1] in ("°", " %") else ""
-        bare = gate.shown(limit).removesuffix(_SHOWN[unit][1])
+        limit_unit = UNITS_SHOWN[unit][1] if UNITS_SHOWN[unit][1] in ("°", " %") else ""
+        bare = gate.shown(limit).removesuffix(UNITS_SHOWN[unit][1])
         text = f"{title}: {gate.shown(value)} ({sense} {bare}{limit_unit})"
         return msgspec.structs.replace(gate, text=f"{text} PASS" if passed else f"{text} FAIL. {remedy}")
 
     def shown(self, figure: float | None) -> str:
         """Format a figure of this gate with the unit for people (mm for m, for instance)."""
-        factor, suffix = _SHOWN.get(self.unit, (1.0, ""))
+        factor, suffix = UNITS_SHOWN.get(self.unit, (1.0, ""))
         return "–" if figure is None else f"{figure * factor:.3g}{suffix}"
 
     @property

@@ -19,7 +19,8 @@ PACKAGES = ("recordings", "calibrate", "station", "tests", "benchmarks")
 _LAYOUT = {tokenize.NL, tokenize.NEWLINE, tokenize.COMMENT, tokenize.INDENT, tokenize.DEDENT}
 _HEAD = """\
 # What the project may hold; `make check` fails above it. After a deletion: make budget.
-# A number rises only in a commit that lowers another, or where an issue names the rise.
+# To raise a number, lower another one in the same commit, or first have an issue of this project agree to the
+# rise: it says which number, from what to what, and why. Then write the new number here by hand.
 """
 
 

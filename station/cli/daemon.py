@@ -48,7 +48,7 @@ def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
     root = state_root()
     config = config or find_config()
     what = ["--simulate"] if config is None else ["--config", str(config)]
-    cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
+    cell = "a SIMULATED cell (none set up: `station new`)" if config is None else f"the cell of {config}"
     print(f"Starting {cell} …", file=sys.stderr)
     root.mkdir(parents=True, exist_ok=True)
     _started([*what, "--socket", str(socket)], root / "daemon.log", subprocess.DEVNULL)

@@ -1,14 +1,37 @@
 """STOP as everybody sends it: one datagram. `station stop`, without slow imports, then checks its effect.
 
-From a person to the wire:
-  1. `send_stop` here, called by `station stop`, by the process that reads the screen's F12 (`tui.stop_key`),
-     and by `protocol.client` before the verb `stop`: for the screen and for Ctrl-C at a command. The screen
-     sends both because it can be clicked, and a datagram has no answer. A STOP more does no harm.
-  2. In the daemon `server.stop_server` reads the datagram, `server.connections` the verb. Both call
-     `server.dispatch`, and this `session.session.Session.stop`, then `_halt`. The loss of control and the
-     daemon's end lead to `_halt`, too.
-  3. `devices.ur.UrRobot.stop` sends it out by two ways at once: port 29999 (`ur_dashboard`), and the control
-     process (`ur_child`, `ur_control`), which calls `stopJ` of ur_rtde or `ur_script`.
+From a person to the wire, by files and functions in `station/` (tests/test_pages.py checks that they exist):
+  F12: a process between terminal and screen, which draws nothing, sends the datagram b"STOP" at once:
+    `tui/stop_key.py:_pass_keys`, `protocol/stop_client.py:send_stop`. Where the screen is not started in the
+    foreground of a terminal there is no such process, and the screen alone sends it.
+  F12 or a click, by the screen: the datagram again, as it can be clicked, and then the verb "stop" over the
+    connection, as a datagram has no answer. A STOP more does no harm. `tui/app.py:StationApp.action_stop`,
+    `tui/daemon_link.py:DaemonLink.stop`, `protocol/client.py:Client.call, Client.request, Client.send_stop`.
+  `station stop`: the datagram, then it watches the motion page (below) until the arm rests.
+    `cli/__init__.py:main`, `protocol/stop_client.py:main, stop_and_tell, stop, _send_and_watch, send_stop`.
+  In the daemon: approval and run end, the state is STOPPED, the arm is stopped.
+    `server/stop_server.py:StopServer._woken, _read, _carry_out`,
+    `server/dispatch.py:SessionDispatcher.stop_by_datagram`, `session/session.py:Session.stop, _halt,
+    _stop_arm`, `devices/ur.py:UrRobot.stop`. The socket is also read at the beginning of every round of the
+    session: `session/supervisor.py:SessionSupervisor._round`, `server/stop_server.py:StopServer.round`.
+  From there by two ways at once; neither waits for the other:
+    The robot's dashboard: b"stop\\n" to port 29999, also where the station has no control.
+      `devices/ur_dashboard.py:Dashboard.send`.
+    The control process: {"do": "stop", "deceleration": 4.0} on its socket, rad/s²; it calls stopJ(4.0) of
+      ur_rtde, or of the station's own script, which gets an RTDE data packet (type "U") with the command
+      STOP: stopj(4.0) where it moves, then halt. `devices/ur_child.py:ControlChild.stop, _send`,
+      `devices/ur_control.py:MotionServer.serve`, `devices/ur_script.py:ScriptControl.stopJ`.
+  Where the dashboard does not answer "Stopped" within 50 ms it is asked again on a new connection. The
+    control process is killed after 50 ms, or once it answered; a program that it left playing is stopped.
+    `devices/ur.py:UrRobot._finish_stop, _dashboard_stop_anew, _stop_leftover_program`.
+  Where the daemon hangs, no way above is left. Its session beats no more, the control process resets the
+    controller's watchdog only for a fresh beat, and the watchdog stops the arm in 0.2 s (decision 0045).
+    `session/supervisor.py:SessionSupervisor._round`, `devices/ur_control.py:MotionServer._beat`.
+  The same from the function named: the verb, `server/connections.py:_take`; Ctrl-C at a command,
+    `cli/session.py:attended`; signals to the daemon, `daemon.py:Daemon.end`; a client in control that is
+    gone, `server/dispatch.py:SessionDispatcher.gone`.
+  F12 in `station new`: no daemon runs yet, the dashboard alone. `tui/new_cell.py:NewCell.action_stop`,
+    `cli/new.py:GuidedArm.stop`, `devices/ur_dashboard.py:Dashboard.ask`.
 
 STOP is sent to whatever listens on the socket. It is reported as done only if the genuine daemon says so on
 the motion page, a small file beside the socket that only the daemon's user can have made. It tells how many

@@ -35,7 +35,7 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
     moves: ClassVar[bool] = False
     """For arms that the station moves only."""
     spoken: ClassVar[str] = ""
-    """Name for people; empty: the verb's name."""
+    """What the operator wants by it, as in "… is not possible now"; empty: the verb's name says it."""
     wire: ClassVar[str] = ""
     """Name in messages; empty: derived from the class's (`LoadPlan`: load_plan)."""
 
@@ -243,6 +243,7 @@ class Go(Verb[Done], frozen=True):
 
     states = RESTING
     moves = True
+    spoken = "starting a motion"
     token: str
     approval_sha256: str = ""
 
@@ -265,6 +266,7 @@ class Retake(Verb[Done], frozen=True):
 
     states = RUNNING | RESTING
     moves = True
+    spoken = "taking a pose again"
     index: int
 
 
@@ -272,6 +274,7 @@ class Skip(Verb[Done], frozen=True):
     """Leave a pose out; in freedrive: take back its image."""
 
     states = RUNNING | RESTING | {S.FREE_DRIVE}
+    spoken = "leaving a pose out"
     index: int
 
 
@@ -279,6 +282,7 @@ class Freedrive(Verb[Done], frozen=True):
     """Begin or end capture by hand."""
 
     wire = "free_drive"
+    spoken = "capture by hand"
     states = RESTING | {S.FREE_DRIVE}
     on: bool
     check: bool = False

@@ -25,7 +25,7 @@ DEFAULTS = {name: limit for name, limit in msgspec.structs.asdict(GateLimits()).
 
 @pytest.fixture
 def solution(solved_real: SolvedRecording) -> Solution:
-    """One that every gate lets through."""
+    """One that every gate lets through: the figure of a new gate gets a good value here."""
     found = solved_real.solution
     holdout = HoldoutScore(0.0005, 0.001, [0.0005], [0.001], [(0, 1)], 12)
     noise = MeasurementNoise(0.1, 0.0001, 0.0002)
@@ -58,7 +58,7 @@ def test_a_good_solution_passes_every_gate(solution: Solution) -> None:
 
 
 def spoiled(solution: Solution, name: str) -> tuple[Solution, float]:
-    """Solution and bound of the clocks that close this gate alone."""
+    """Solution and bound of the clocks that close this gate alone: a new gate gets a bad figure here."""
     seen, folds = solution.observability, solution.cross_validation
     other = Explanation(Reading.SHIFTED, 90.0, 1)
     changed = {

@@ -27,11 +27,16 @@ def export(
         anyway = "a calibration file that is named is exported all the same"
         require_usable(frames.validity, "The installed calibration", anyway)
     if form.frames == "fixed" and (frames.base, frames.flange) != (usual.base, usual.flange):
-        raise UsageError("frames-of", format=name)
+        raise UsageError("frames-of", format=name, known=_formats("named", "attached"))
     if frames.attach and form.frames != "attached":
-        raise UsageError("attach-of", format=name)
+        raise UsageError("attach-of", format=name, known=_formats("attached"))
     if arm is not None:
         if name != "urdf":
             raise UsageError("arm-of-urdf")
         return corrected_urdf(calibration, frames, arm)
     return form.make(calibration, frames).encode()
+
+
+def _formats(*frames: str) -> str:
+    """Name the formats with these kinds of frames (`formats.Frames`), for people."""
+    return ", ".join(name for name, form in FORMATS.items() if form.frames in frames)

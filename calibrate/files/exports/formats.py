@@ -1,7 +1,9 @@
 """The formats of `calibrate export`: a function below `@export_format` is one.
 
 Its name is the format's, `_` for `-`. The first line of its docstring is its help, the rest tells what the
-file holds; the command and docs/reference/formats.md take them from there. `vision.zivid` is a short example.
+file holds; the command and docs/reference/formats.md (`make pages`) take them from there. `vision.zivid` is a
+short example; one with names of frames is `ros.ros_launch`. A new module is imported in
+`exports/__init__.py`.
 
 It is given the calibration and the names of frames. The camera's place is `calibration.transform.matrix`,
 the optical frame in its parent, (4, 4) in metres; its lens `calibration.intrinsics.model`. It returns the

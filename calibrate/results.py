@@ -257,3 +257,5 @@ class DriftFigures(msgspec.Struct, frozen=True, eq=False):
     views: int
     arm_known: bool
     """False: errors of the arm are not told from a shift, so that a failure proves nothing."""
+    elsewhere: bool = False
+    """The views are outside the range of the calibration's, where the robot's stated error counts."""

@@ -143,7 +143,8 @@ def find_shift(views: ViewSet, known: KnownCell) -> DriftCheck:
     away = prior.away(found.state)
     evidence = Quadratic(evidence.N, evidence.right + evidence.N @ away)
     # Where the calibration's views were, the arm errs as it did then; elsewhere it errs otherwise.
-    by = _Shift(known, prior, 2.0 * known.leaves_range(views) * known.stated_arm_error)
+    elsewhere = bool(known.stated_arm_error.any()) and known.leaves_range(views)
+    by = _Shift(known, prior, 2.0 * elsewhere * known.stated_arm_error)
     shift, covariance = by.of(evidence)
     statistic = float(shift @ np.linalg.solve(covariance, shift))
     nu = known.freedom
@@ -164,6 +165,7 @@ def find_shift(views: ViewSet, known: KnownCell) -> DriftCheck:
         disagreement=float(misfit / max(6 * len(views) - absorbed, 1.0)),
         views=len(views),
         arm_known=known.knows_arm,
+        elsewhere=elsewhere,
         evidence=evidence,
     )
 

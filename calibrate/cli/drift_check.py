@@ -242,6 +242,11 @@ def production_text(result: DriftCheck, pictures: int) -> str:
 
 
 def _more_text(result: DriftCheck, calibration: Calibration) -> str:
+    if result.elsewhere:
+        return (
+            "These poses lie outside the calibration's, where the arm may err otherwise by what is stated of "
+            "it. Check where it was calibrated."
+        )
     if result.views_needed is not None:
         return (
             f"Capture {result.views_needed - result.views} more for {POWER:.0%}: "

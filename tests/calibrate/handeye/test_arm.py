@@ -198,6 +198,7 @@ def test_wrong_poses_cost_no_more_than_their_views(mount):
     assert inside(solution := solve_views(spoilt, QUICK), cell.X) and solution.arm.detected
     spoilt, sound = (solve_views(without_joints(views), QUICK) for views in (spoilt, cell.views.select(good)))
     assert spoilt.sigma_translation_m == pytest.approx(sound.sigma_translation_m, rel=0.1)
+    assert spoilt.posterior.flange_extent_m == pytest.approx(sound.posterior.flange_extent_m, rel=1e-3)
 
 
 @MOUNTS

@@ -89,8 +89,12 @@ class CellSetup:
         if self.draft.camera == chosen and self.camera is not None:
             return False
         camera = await self._hardware.camera(chosen)
-        await camera.expose(self.draft.exposure_us)
-        image = await _exposed(camera)
+        try:
+            await camera.expose(self.draft.exposure_us)
+            image = await _exposed(camera)
+        except BaseException:  # else it is in use when it is tried again
+            await camera.close()
+            raise
         if self.camera is not None:
             await self.camera.close()
         self.camera = camera

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from unittest.mock import AsyncMock
 
 import cv2
 import msgspec
@@ -16,12 +17,13 @@ from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
 from station.analysis.worker import sight
 from station.cell.config_file import load_config
+from station.cell.errors import CameraError
 from station.cell.layout import layout_of
 from station.cli.new import RealHardware
 from station.operate import draft as drafts
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
-from station.operate.draft import CellStep, Draft
+from station.operate.draft import CameraChoice, CellStep, Draft
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.cells import make_cell
 from station.simulation.renderer import Light, render
@@ -151,6 +153,16 @@ def test_views_that_fit_the_other_drawing_correct_the_mounting(
     setup.change_mount()
     assert setup.correct_mount() and setup.draft.mount == done[0].mount
     assert setup.draft.found is not None and setup.draft.found.good
+
+
+async def test_a_camera_without_an_image_is_closed(tmp_path: Path) -> None:
+    hardware, camera = AsyncMock(), AsyncMock()
+    hardware.camera.return_value, camera.glimpse.side_effect = camera, CameraError("no-image", limit_s=1.0)
+    with pytest.raises(CameraError):
+        await CellSetup(hardware, tmp_path, tmp_path / "station.yaml").open(
+            CameraChoice("webcam", "0", "a webcam")
+        )
+    camera.close.assert_awaited_once()
 
 
 BOARDS = ("8x5 23", "charuco 8x6 23", "circles 7x6 23", "asymmetric-circles 4x11 15", "april-grid 5x4 30 9")

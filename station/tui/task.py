@@ -88,8 +88,9 @@ class Known:
 
     @property
     def hand_guided(self) -> bool:
-        """Views are taken by hand, also while one is being saved."""
-        return self.shown.state is StationState.FREE_DRIVE or bool(self.shown.guidance.outline)
+        """Views are taken by hand, also while one is saved. After a STOP the status keeps the last outline."""
+        state, outline = self.shown.state, self.shown.guidance.outline
+        return state is StationState.FREE_DRIVE or (state in RUNNING and bool(outline))
 
     @property
     def blind(self) -> bool:

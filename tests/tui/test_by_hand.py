@@ -58,6 +58,8 @@ async def test_the_wanted_view_is_drawn_a_view_sounds_and_is_taken_back(link: Fa
         await until(pilot, lambda: footer(app).get("f6") and footer(app).get("f3") == "End freedrive")
         await pilot.press("f3")  # ends it after the view that is being taken
         await until(pilot, lambda: verbs.Pause() in link.asked)
+        link.show(msgspec.structs.replace(by_hand(3), state=StationState.STOPPED))
+        await until(pilot, lambda: "f8" in footer(app) and "f3" not in footer(app))
         link.show(idle())
         await until(pilot, lambda: not outlined(pane))
 

@@ -55,6 +55,9 @@ async def test_neither_watchers_nor_states_that_fail_come_between_stop_and_the_a
     assert "stop" in rig.arm.log and rig.session._run.cancelling()
     await rig.session.stop("bert")
     assert rig.state is S.STOPPED
+    sent = rig.arm.log.count("stop")
+    await rig.session.stop("anna")
+    assert rig.arm.log.count("stop") == sent + 1, "each STOP is sent, also where one is latched"
 
 
 async def test_an_offer_does_not_outlive_the_sleep_of_its_computer(rig: Rig, monkeypatch: Any) -> None:
@@ -82,7 +85,7 @@ async def test_a_stop_behind_an_acknowledgement_stays_latched(rig: Rig, state: S
 
 
 @pytest.mark.parametrize("offered", [False, True], ids=["while the path is checked", "after the offer"])
-@pytest.mark.parametrize("change", ["stop", "edit", "release", "prepare"])
+@pytest.mark.parametrize("change", ["stop", "edit", "release", "prepare", "freedrive", "load plan"])
 async def test_what_changes_leaves_no_approval(rig: Rig, change: str, offered: bool) -> None:
     gate = Gate(rig)
     preparing = asyncio.ensure_future(rig.session.prepare(1, Purpose.RUN))
@@ -98,6 +101,10 @@ async def test_what_changes_leaves_no_approval(rig: Rig, change: str, offered: b
     elif change == "release":
         await rig.session.release(1)
         rig.session.take_lease(1, "anna")
+    elif change == "freedrive":
+        await rig.session.switch_free_drive(1, on=False)
+    elif change == "load plan":
+        rig.session.load_plan(1, rig.session.context.queue.plan)
     else:
         later = asyncio.ensure_future(rig.session.prepare(1, Purpose.RUN))
         await asyncio.sleep(0)
@@ -108,6 +115,15 @@ async def test_what_changes_leaves_no_approval(rig: Rig, change: str, offered: b
         assert (await later).poses == POSES
     else:
         assert rig.session.approvals.waiting is None
+
+
+async def test_a_finished_session_is_not_gone_on_with_by_an_earlier_approval(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
+    token = (await rig.session.prepare(1, Purpose.RESUME)).token
+    await rig.session.finish(1)
+    with raises("approval-used"):
+        await rig.session.go(1, token)
 
 
 async def test_a_robot_that_was_lost_voids_the_go(rig: Rig) -> None:

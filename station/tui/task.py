@@ -88,7 +88,7 @@ class Known:
 
     @property
     def hand_guided(self) -> bool:
-        """Views are taken by hand, also while one is saved. After a STOP the status keeps the last outline."""
+        """Views are taken by hand, also while one is saved; a STOP leaves the outline in the status."""
         state, outline = self.shown.state, self.shown.guidance.outline
         return state is StationState.FREE_DRIVE or (state in RUNNING and bool(outline))
 

@@ -301,7 +301,9 @@ def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
 
 async def test_stop_without_a_connection_is_named_by_the_persons_terminal(served: Served) -> None:
     dispatcher = SessionDispatcher(served.rig.session, at_a_terminal)
+    assert not dispatcher.latched
     await dispatcher.stop_by_client(Peer(0, 5, os.getuid()))
+    assert dispatcher.latched and dispatcher.speed_rad_s == 0.0  # what `station stop` is told
     assert f"uid {os.getuid()} (pid 5)" in served.rig.session.store.status.reason  # it asked nothing before
     await served.rig.session.acknowledge("anna")
     dispatcher.stop_by_datagram(Peer(0, 5, os.getuid()))

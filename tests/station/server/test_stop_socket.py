@@ -309,6 +309,11 @@ async def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path, mode
             folder_owner(inside)
 
 
+def test_a_new_folder_is_this_users_alone(tmp_path: Path) -> None:
+    make_folder(tmp_path / "a" / "run")
+    assert stat.S_IMODE((tmp_path / "a" / "run").stat().st_mode) == 0o700
+
+
 def test_without_a_runtime_folder_the_socket_lies_where_nobody_else_can_be_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,16 +46,19 @@ class RecordingInfo(msgspec.Struct, frozen=True):
     """As the first segment describes it."""
     segments: int
     missing: tuple[str, ...]
+    """Segments that the session has and that are not there, in sentences."""
     losses: tuple[str, ...]
+    """What recovery could not save, and segments given up as lost, in sentences."""
     size_bytes: int
     sha256: str
     poses: int
-    """Poses with a view that counts."""
+    """Poses with a view that a solve uses: their newest one, unless it was taken back."""
     attempts: int
-    """All views: retakes and those that were taken back, too."""
+    """Views that were taken, retakes and those taken back later included."""
     taken_back: int
+    """Views that the operator took back: no solve uses them."""
     topics: list[TopicInfo]
-    """Ours first."""
+    """Those of `schema.topics` first, then other programs'."""
     robot_states: RobotStatesInfo | None
     images: int
     time_bounds_s: dict[str, float]
@@ -112,7 +115,7 @@ def _topic(name: str, indexes: list[MessageIndex]) -> TopicInfo:
 
 
 def _robot_states(recording: Recording) -> RobotStatesInfo | None:
-    """The time between two segments is no gap."""
+    """Measure rate and gaps inside each segment: the time between two segments counts as no gap."""
     steps_s = np.concatenate([np.diff(_controller_s(segment)) for segment in recording.segments])
     if not len(steps_s):
         return None

@@ -16,18 +16,18 @@ from calibrate.geometry import Array
 from recordings.schema.messages import BoardKind, BoardSpec
 
 _FEW_MARKERS = 0.7
-"""Share of the markers of the board."""
+"""Share of the board's markers; where fewer are found, the image is brightened and enlarged."""
 _SMALL_MARKER_PX, _ENLARGED, _LARGEST_SIDE_PX = 20.0, 3.0, 6000
 """Markers with shorter sides are read in an enlarged image, unless that would be larger than this."""
 _SMALLEST_PERIMETER = 0.03
 """Perimeter of a marker over the longer side of the image; OpenCV's own."""
 _ASTRAY, _MOST = 0.5, 0.75
-"""Farther than this share of its side from where the board has it, a marker does not lie as printed: half the
-way to the next one, as a lens bends the board; share of the markers that must. Of a board in the legacy order
-half of them do."""
+"""A marker lies as printed if it is nearer to its place on the board than this share of its side: so much
+because a lens shifts it, too. The second: share of the markers that must, else it is another board. With a
+board in the other order (`legacy`) half of them do."""
 _NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
-"""A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
-and than so many times the middle one."""
+"""The sub-pixel search is not believed where it moves a corner from its prediction by more than this share of
+the corners' spacing and by more than this multiple of the median move."""
 Indices = NDArray[np.intp]
 NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
 

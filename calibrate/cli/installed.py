@@ -63,10 +63,10 @@ def export(
     file: Named = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Default: stdout")] = None,
     base: Annotated[
-        str, typer.Option(help="Name of the robot's base there; base_link is turned")
+        str, typer.Option(help="Robot's base in the file; for ROS's base_link the pose is converted")
     ] = FrameNames.base,
     flange: Annotated[
-        str, typer.Option(help="Name of its flange there; flange is turned")
+        str, typer.Option(help="Its flange in the file; for ROS's flange the pose is converted")
     ] = FrameNames.flange,
     frame: Annotated[
         str,

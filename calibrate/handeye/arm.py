@@ -88,15 +88,15 @@ def gravity_in_flange(flange: Array) -> Array:
     return np.asarray(-flange[:, 2, :3])
 
 
-def flex_motion(flange: Array, level: Array | None = None) -> Array:
+def flex_motion(flange: Array, mean_gravity: Array | None = None) -> Array:
     """Compute the motion (n, 6, 9) of the flange, in base, by each entry of a bracket's compliance (3, 3).
 
     A bracket of camera (eye-in-hand) or board bends near the flange: it turns about the flange's origin by
-    the compliance times the direction of gravity in the flange. The bend at gravity `level` (3,), None: the
+    the compliance times the direction of gravity in the flange. The bend at `mean_gravity` (3,), None: the
     mean of the views, is subtracted: it belongs to X or Y.
     """
     R, gravity = flange[:, :3, :3], gravity_in_flange(flange)
-    gravity = gravity - (gravity.mean(axis=0) if level is None else level)
+    gravity = gravity - (gravity.mean(axis=0) if mean_gravity is None else mean_gravity)
     turn = R @ np.einsum("rk,nc->nkrc", np.eye(3), gravity).reshape(len(R), 3, 9)
     return np.concatenate([np.zeros_like(turn), turn], axis=1)
 

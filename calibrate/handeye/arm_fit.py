@@ -17,7 +17,7 @@ from scipy import special
 from calibrate.geometry import Array
 from calibrate.handeye.arm import FLEX
 from calibrate.handeye.cell_state import CellState
-from calibrate.handeye.estimate import Estimate, MeanParts, estimate
+from calibrate.handeye.estimate import Estimate, MixtureParts, estimate
 from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import Priors
@@ -118,7 +118,7 @@ def estimate_with_arm_errors(
         @ [linear.noise_parts(s, own) for s, own in zip(solutions, covariances, strict=True)],
         log_evidence=log_all,
         # Variances of X in each part over that of the mixture, averaged over directions.
-        mean_of=MeanParts(
+        mixture=MixtureParts(
             chances, np.einsum("ij,sji->s", inverse_of(covariance[:6, :6]) / 6, spread[:, :6, :6])
         ),
     )

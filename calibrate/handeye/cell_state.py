@@ -95,20 +95,21 @@ def flange_derivatives(mount: Mount, X: Array, Y: Array, C: Array, miss: Array) 
     F = implied_flange(mount, X, Y, C)
     near, far = (Y, X) if eye_in_hand else (X, Y)
     R_F, R_C, t_C = F[:, :3, :3], C[:, :3, :3], C[:, :3, 3]
-    # F = near · M · far⁻¹ with M = C⁻¹ or C, and `arm` from M's child to far's origin
+    # F = near · M · far⁻¹ with M = C⁻¹ or C. Offset: from the flange's origin to the board's, in the camera's
+    # axes. Lever: to the flange's origin from that of near's child frame, in base.
     R_near = np.broadcast_to(near[..., :3, :3], R_F.shape)
     t_far = np.broadcast_to(far[..., :3, 3], t_C.shape)
     in_far = np.einsum("...ji,...j->...i", far[..., :3, :3], far[..., :3, 3])
     zero, eye = np.zeros(R_F.shape), np.broadcast_to(np.eye(3), R_F.shape)
     if eye_in_hand:
         turn = R_near @ np.swapaxes(R_C, 1, 2)
-        arm = in_far + t_C
-        by_C = _blocks(-turn, -turn @ skew(arm), zero, -turn)
-        lever = -np.einsum("nij,nj->ni", turn, arm)
+        offset = in_far + t_C
+        by_C = _blocks(-turn, -turn @ skew(offset), zero, -turn)
+        lever = -np.einsum("nij,nj->ni", turn, offset)
     else:
-        arm = (R_C @ in_far[..., None])[..., 0]
-        by_C = _blocks(R_near, R_near @ skew(arm), zero, R_near)
-        lever = np.einsum("nij,nj->ni", R_near, t_C - arm)
+        offset = (R_C @ in_far[..., None])[..., 0]
+        by_C = _blocks(R_near, R_near @ skew(offset), zero, R_near)
+        lever = np.einsum("nij,nj->ni", R_near, t_C - offset)
     by_near = _blocks(eye, -skew(lever), zero, eye)
     by_far = _blocks(-R_F, -R_F @ skew(t_far), zero, -R_F)
     bend = inverse_left_jacobian(miss[:, 3:])

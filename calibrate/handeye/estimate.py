@@ -23,7 +23,8 @@ from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.views import Observations
 
 REJECTED = 0.05
-"""Probability, of noise up to three times the usual, at or below which a view is rejected."""
+"""A view is rejected where at most this probability is left that the robot's noise in it is up to three times
+the ordinary one (the first two classes of `mixture.GAIN`)."""
 FULL = 0.35
 """Probability of the class of ordinary noise above which a view counts fully."""
 _SETTLED = 0.01
@@ -31,7 +32,7 @@ _SETTLED = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class MeanParts:
+class MixtureParts:
     """Components of the mixture of normal distributions that an estimate averages over.
 
     A mixture has heavier tails than one normal distribution, so its 95 % region is wider.
@@ -62,10 +63,12 @@ class Estimate:
     corner_weights: Array
     """(n, k) in 0 … 1"""
     noise_parts: Array
-    """(3,) variance of X, whitened, from corners, robot translation and robot rotation."""
+    """(3,) variance of X by the noise of corners, robot translation and robot rotation: each the trace of its
+    covariance (6, 6) after X's own covariance is made the unit matrix."""
     log_evidence: float
     converged: bool
-    mean_of: MeanParts = field(default_factory=MeanParts)
+    mixture: MixtureParts = field(default_factory=MixtureParts)
+    """One part: the posterior is taken as one normal distribution."""
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -80,7 +83,7 @@ class Estimate:
     @property
     def threshold(self) -> float:
         """Limit of δᵀ C⁻¹ δ that holds the true X with 95 %: 6·F(6, ν), ν = 3n - 6 of n views that count."""
-        freedom, chances, ratio = self.freedom, self.mean_of.chances, self.mean_of.camera_ratio
+        freedom, chances, ratio = self.freedom, self.mixture.chances, self.mixture.camera_ratio
         one = float(6 * special.fdtri(6, freedom, 0.95))
         if len(chances) == 1:
             return one

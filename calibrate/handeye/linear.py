@@ -184,7 +184,10 @@ class Linear:
         return np.asarray((rows @ covariance).reshape(self.J.shape) @ np.swapaxes(self.J, 1, 2))
 
     def noise_parts(self, solved: LinearSolution, covariance: Array) -> Array:
-        """Compute X's whitened variance (3,) from corners, robot translation and robot rotation."""
+        """Compute X's variance (3,) by the noise of corners, robot translation and robot rotation.
+
+        Each is the trace of that part of X's covariance after X's own covariance is made the unit matrix.
+        """
         gain = covariance[:6] @ np.swapaxes(self.J, 1, 2) @ solved.W
         m, rad = np.diag(solved.scales.classes[0]) * np.repeat(np.eye(2), 3, axis=1)[:, None]
         sources = (solved.scales.tau_px**2 * self.V, m, rad)

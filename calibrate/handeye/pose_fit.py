@@ -25,7 +25,7 @@ from calibrate.projection import intrinsics_vector
 from calibrate.views import Places, ViewSet, implied_flange, observe_views
 from recordings.schema.messages import Mount
 
-_SUBSETS, _OF = 120, 4
+_SUBSETS, _SUBSET_VIEWS = 120, 4
 """Subsets, and views in each. Where 45 % of the views are wrong, the four are right in one subset of eleven,
 and in none of 120 once in 100,000 recordings."""
 _VOTERS = 60
@@ -81,13 +81,16 @@ class Start:
 def agreed_start(H: Array, boards: BoardPoses, seed: int, candidate: Array | None = None) -> Start:
     """Find the X, board pose and factors on which the largest part of the views agrees best.
 
-    H as in `pairs`, (n, 4, 4). Park and Martin's method (1994) on subsets of four views; the one with the
-    least 55 % quantile of the distance from the most central board pose wins. `candidate`: a further X (4, 4)
-    to compare.
+    H: (n, 4, 4) robot poses by `pairs.mount_poses`. Park and Martin's method (1994) finds an X from each of
+    many subsets of four views. With each X every view gives a board pose; the X wins whose board poses lie
+    closest together: with the smallest ball, about one of them, that holds 55 % of them. `candidate`: a
+    further X (4, 4) to compare.
     """
     n = len(H)
     rng = np.random.default_rng(seed)
-    subsets = np.array([rng.permutation(n)[:_OF] for _ in range(_SUBSETS)]) if n > _OF else np.arange(n)[None]
+    subsets = np.arange(n)[None]
+    if n > _SUBSET_VIEWS:
+        subsets = np.array([rng.permutation(n)[:_SUBSET_VIEWS] for _ in range(_SUBSETS)])
     Xs, factors = _of_subsets(H, boards, subsets)
     if candidate is not None:
         Xs = np.concatenate([candidate[None], Xs])

@@ -40,7 +40,7 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     found = fit.estimate if smooth is None else smooth
     state, scales, kept = found.state, found.scales, Layout.of(found.state).all_but_board
     flanges = fit.views.base_from_flange
-    level = gravity_in_flange(flanges).mean(axis=0)
+    gravity = gravity_in_flange(flanges).mean(axis=0)
     extent = flange_extent(flanges[fit.plain.used])
     return Posterior(
         X=as_rows(state.X),
@@ -55,7 +55,7 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
         board_extent_m=as_rows(fit.observed.extent),
         arm=None if chain is None else chain.plain,
         stated_arm_error=as_rows(stated_arm_error) if stated_arm_error.any() else None,
-        level=tuple(level.tolist()) if len(state.arm_errors) else None,
+        level=tuple(gravity.tolist()) if len(state.arm_errors) else None,
         flange_extent_m=None if smooth is None else tuple(extent.tolist()),
         without_joints=None
         if chain is None or fit.smooth is None
@@ -78,8 +78,11 @@ class KnownCell:
     """(2, 2) as `Observations.extent`."""
     chain: Chain | None
     """The arm as its controller computes it; None: nothing is known of its links' errors."""
-    level: Array | None
-    """(3,) mean direction of gravity in the flange over the fit's views; None: no bends are modelled."""
+    gravity: Array | None
+    """(3,) mean direction of gravity in the flange over the fit's views; None: no bends are modelled.
+
+    A bracket's bend is counted from the one at this direction; `level` in the calibration file.
+    """
     stated_arm_error: Array = field(default_factory=lambda: np.zeros((6, 6)))
     """(6, 6) as `Posterior.stated_arm_error`."""
     flange_extent: Array | None = None
@@ -173,8 +176,8 @@ class KnownCell:
             columns = self.chain.by_links(joints)
         if self.flange_extent is not None:
             columns = smooth_motion(views.base_from_flange, self.flange_extent)
-        if self.level is not None:
-            flex = flex_motion(views.base_from_flange, self.level)
+        if self.gravity is not None:
+            flex = flex_motion(views.base_from_flange, self.gravity)
             columns = np.concatenate([columns, flex], axis=2)
         return replace(observed, by_arm_errors=columns)
 

@@ -44,7 +44,7 @@ class Selection:
 
 @dataclass(frozen=True, eq=False)
 class JointTrack:
-    """The arm's joints over time, base first."""
+    """The arm's joints over time; columns from the joint nearest to the base to the one at the flange."""
 
     topic: str
     stamps_ns: NDArray[np.int64]
@@ -110,7 +110,11 @@ def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> BagTopic:
 
 
 def _camera(bag: Bag, image: BagTopic) -> CameraModel | None:
-    """The lens by the innermost namespace that holds the image topic; its last message. None: none does."""
+    """The lens that belongs to the image topic, by the last camera_info message beside it.
+
+    That of the longest namespace in which the image lies: for /cell/left/image_raw /cell/left/camera_info,
+    before /cell/camera_info. None where there is none, or where several are equally near.
+    """
     spaces = {topic.name: "".join(topic.name.rpartition("/")[:2]) for topic in _of(bag, Kind.CAMERA)}
     around = [space for space in spaces.values() if image.name.startswith(space)]
     inner = max(around, key=len, default="")

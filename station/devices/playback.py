@@ -79,6 +79,7 @@ class PlaybackCamera:
         return {"device": str(self._robot.path)}
 
     async def glimpse(self) -> Image:
+        """Return the recorded image of where the robot stands, as it was recorded."""
         if not self._playing:
             raise CameraError("not-open")
         return await asyncio.to_thread(self._robot.picture)

@@ -19,13 +19,16 @@ from station.devices.news import MOVING_S
 from station.devices.ur_condition import control_ended
 
 ARRIVED_RAD = 0.01
+"""Largest distance of a joint from its goal at which the move has arrived."""
 STRAYED_RAD = 0.05
 """Deviation of a joint from the straight path above which the arm has left it: 65 mm at 1.3 m."""
-PROGRESS_RAD = 5e-4
-NO_PROGRESS_S = 3.0
+PROGRESS_RAD, NO_PROGRESS_S = 5e-4, 3.0
+"""A move ends as a fault where its joints' largest distance from the goal changed by no more than this for so
+long."""
 SLIDER_ZERO_S = 10.0
 """Longest wait for a speed slider at 0; the move then ends, lest the arm start unexpectedly."""
 SLIDER_STILL = 0.005
+"""Fraction of the speed, as the controller tells it, below which the slider counts as at 0."""
 JOINT_SPEED_LIMIT_RAD_S = 1.05
 JOINT_ACCELERATION_LIMIT_RAD_S2 = 1.5
 STOP_RAD_S2 = 4.0
@@ -61,7 +64,8 @@ def beside(
 ) -> tuple[int, float]:
     """Find the joint furthest from the straight path, counted from 0, and its deviation (rad).
 
-    A joint move is straight in joint space, all joints in step, as the check of its path assumes.
+    The check of a path assumes that all joints move in step from start to target: straight in joint space.
+    Compared with the point of that line nearest to the joints, but not beyond its ends.
     """
     way = [b - a for a, b in zip(start_rad, target_rad, strict=True)]
     gone = [q - a for a, q in zip(start_rad, joints_rad, strict=True)]

@@ -35,6 +35,7 @@ class ViewRange:
     """Distance of every board corner from the image's edge, beyond `border_px`, in standard deviations of its
     pixel by the uncertainty of the initial poses."""
     smallest_singular: float = 0.03
+    """Least `kinematics.singularity_measure` of a pose: near 0 a slow flange may need fast joints."""
 
 
 _NEAR_FILL, _FAR_FILL = 0.64, 0.40

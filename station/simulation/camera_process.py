@@ -44,7 +44,10 @@ class CameraProcess:
         self._place: Array = np.array(truth.board_place)
 
     def place(self, base_from_flange: Array) -> None:
-        """Take images from this pose (4, 4) of the flange, until the next: no controller knows it."""
+        """Take images from this pose (4, 4) of the flange until another is given, without the controller.
+
+        For arms that no controller is simulated of: their program posts the poses.
+        """
         self._placed = base_from_flange
 
     def warm_up(self) -> None:

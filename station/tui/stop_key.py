@@ -34,16 +34,20 @@ _LAST_PICTURE_S = 1.0
 def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
     """Run `show` in a child with a terminal of its own; return when it ended, SystemExit if it failed.
 
-    In the child's place where this process is not in the foreground of a terminal: nobody presses keys there.
+    Three processes: the child runs the screen in a pseudo-terminal, a second one copies what it draws to the
+    person's terminal, and this one reads the keys. Where this process is not in the foreground of a terminal
+    there are no keys to read, and `show` runs in this process.
     """
     if not _in_foreground():
         show()
         return
     size, parent = fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8)), os.getpid()
-    child, glass = pty.fork()
+    child, master = pty.fork()
     if child == 0:
-        die_with_parent(parent)  # a screen that is gone has no control
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup has it ignored
+        # Without this process the screen hears no key, no STOP either: it must end and lose control.
+        die_with_parent(parent)
+        # Under `nohup` the signal is ignored, but the child must end with its terminal.
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
         try:
             fcntl.ioctl(0, termios.TIOCSWINSZ, size)
             show()
@@ -51,22 +55,22 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
             traceback.print_exc()
             os._exit(1)
         os._exit(0)
-    os.set_blocking(glass, False)
-    picture = os.fork()  # no thread: the key would wait for it
+    os.set_blocking(master, False)
+    picture = os.fork()  # a process, as in a thread Python would let the keys wait
     if picture == 0:
-        die_with_parent(parent)  # it holds the child's terminal open
-        os._exit(_pass_picture(glass))
+        die_with_parent(parent)  # left over, it would keep the pseudo-terminal and so the screen
+        os._exit(_pass_picture(master))
     before, drawn = termios.tcgetattr(0), os.pidfd_open(picture)
-    signal.signal(signal.SIGWINCH, lambda *_: _resize(glass))
+    signal.signal(signal.SIGWINCH, lambda *_: _resize(master))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         tty.setraw(0)
-        _resize(glass)
-        _pass_keys(glass, control, [drawn, os.pidfd_open(child)])
+        _resize(master)
+        _pass_keys(master, control, [drawn, os.pidfd_open(child)])
         select.select([drawn], [], [], _LAST_PICTURE_S)
     finally:
         os.kill(picture, signal.SIGKILL)  # where the terminal takes nothing it would wait for ever
-        os.close(glass)  # the child's terminal goes, and with it the child
+        os.close(master)  # the child's terminal goes, and with it the child
         termios.tcsetattr(0, termios.TCSANOW, before)
         termios.tcflush(0, termios.TCIFLUSH)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -81,11 +85,11 @@ def _in_foreground() -> bool:
         return False
 
 
-def _resize(glass: int) -> None:
-    fcntl.ioctl(glass, termios.TIOCSWINSZ, fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8)))
+def _resize(master: int) -> None:
+    fcntl.ioctl(master, termios.TIOCSWINSZ, fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8)))
 
 
-def _pass_keys(glass: int, control: Path, ends: list[int]) -> None:
+def _pass_keys(master: int, control: Path, ends: list[int]) -> None:
     """Pass keys on; what a screen that reads none cannot take is dropped, so that STOP is heard."""
     seen = b""
     while not set(ends) & set(select.select([0, *ends], [], [])[0]) and (data := os.read(0, _CHUNK_BYTES)):
@@ -95,12 +99,12 @@ def _pass_keys(glass: int, control: Path, ends: list[int]) -> None:
             seen = seen[keys[-1].end() :]
         seen = seen[-_KEY_BYTES:]  # a key may come in parts
         with contextlib.suppress(BlockingIOError):
-            os.write(glass, data)
+            os.write(master, data)
 
 
-def _pass_picture(glass: int) -> int:
+def _pass_picture(master: int) -> int:
     try:
-        while select.select([glass], [], [])[0] and (data := os.read(glass, _CHUNK_BYTES)):
+        while select.select([master], [], [])[0] and (data := os.read(master, _CHUNK_BYTES)):
             while data:
                 data = data[os.write(1, data) :]
     except OSError:  # the child ended, or the person's terminal did

@@ -3,11 +3,13 @@
 Shor's relaxation of min ζᵀ S ζ, ζ = [vec R; 1], R in SO(3): rows and columns orthonormal and right-handed,
 30 quadratic equations ζᵀ Q ζ = 0 of which 20 are independent. Any multipliers μ and number ℓ give a bound
 
-    f(R) ≥ ℓ + 4 · min(0, least eigenvalue of S - Σ μ_k Q_k, less ℓ in its last place),   as ‖ζ‖² = 4,
+    f(R) ≥ ℓ + 4 · min(0, λ_min(S - Σ μ_k Q_k - ℓ E)),   E: 1 in the last place of the diagonal, else 0,
 
-so the proof rests on one eigenvalue, not on the SDP solver's tolerance. Clarabel finds y; one linear
-correction makes the candidate an exact null vector (stationarity), which brings the gap from the solver's
-1e-8 of the trace down to rounding. A candidate that is not the minimum cannot pass: for it no y exists.
+as ‖ζ‖² = 4 and the last entry of ζ is 1. So the proof rests on one eigenvalue, not on the SDP solver's
+tolerance. Clarabel finds the multipliers; with ℓ = f at the candidate, one linear least-squares correction
+makes the candidate's ζ a null vector of that matrix, as it must be at a minimum. That brings the gap between
+f and its bound from the solver's 1e-8 of the trace down to rounding. A candidate that is not the global
+minimum cannot pass, as no multipliers give a bound above the minimum.
 """
 
 from __future__ import annotations

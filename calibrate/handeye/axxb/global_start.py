@@ -29,7 +29,11 @@ class GlobalResult:
 
 
 def solve_global(pairs: Pairs, problem: str = "") -> GlobalResult:
-    """Find the global minimum of the chordal objective over `pairs` (at least 2, two axes not parallel)."""
+    """Find the global minimum of the chordal objective over `pairs` (at least 2, two axes not parallel).
+
+    Where the minimum reached first is not certified, that reached from the relaxation's minimiser is tried,
+    and the lower one returned, certified or not. `problem`: text for the certificate.
+    """
     objective = build_objective(pairs)
     first = _from(objective.R0, objective, pairs, problem)
     if first[0].certificate.certified:

@@ -1,6 +1,7 @@
 """Port 29999: the dashboard's text commands, one reply line each, of `dashboard.csv`.
 
-Those that the station sends, and no others: a person at the pendant is port 29990. Source: Universal Robots,
+Only commands that the station sends. What a person does at the pendant is told on port 29990, which no real
+controller has (`admin`). Source: Universal Robots,
 "Dashboard Server e-Series / CB-Series, port 29999". Columns: `cb3` and `e_series`, the first version that
 knows it (empty: none does). `reply`, empty where it depends.
 """

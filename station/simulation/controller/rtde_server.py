@@ -32,9 +32,9 @@ class RtdeServer:
         self.claims: dict[str, object] = {}
         """Input name → the connection (or the admin) that owns it."""
         self.stalled = False
-        """Links live, no data is sent."""
+        """Fault: connections stay open and are answered, but no states are sent."""
         self.frozen = False
-        """The same packet again and again."""
+        """Fault: the last state is sent again every cycle, its clock standing still."""
 
     def send_states(self) -> None:
         """Called once per cycle."""
@@ -57,7 +57,9 @@ class RtdeConnection(Connection):
         self._inputs: list[Recipe] = []
         self._output: Recipe | None = None
         self._elements: Any = None
+        """Takes the elements of the states that this client asked for from all outputs."""
         self._every = 1
+        """Controller cycles from one state sent to the next."""
         self._playing = False
         self._last = b""
         self._handlers = {
@@ -102,6 +104,7 @@ class RtdeConnection(Connection):
         base_hz = self._robot.settings.rate_hz
         self._every = round(base_hz / min(frequency_hz, base_hz)) if frequency_hz >= 1 else base_hz
         self._output = Recipe(1, names, tuple(types))
+        # One index more than asked for, cut off when read: of a single one itemgetter gives no tuple.
         self._elements = itemgetter(*self._robot.outputs.indices(names), 0)
         return b"\x01" + join_names(types)
 

@@ -158,7 +158,7 @@ def test_a_file_without_a_posterior_is_checked_by_its_stated_figures(solved_real
     posterior = solved_real.calibration.posterior
     assert posterior is not None and posterior.errors
     earlier = msgspec.structs.replace(posterior, flange_extent_m=None)
-    assert known_cell(msgspec.structs.replace(solved_real.calibration, posterior=earlier)).level is None
+    assert known_cell(msgspec.structs.replace(solved_real.calibration, posterior=earlier)).gravity is None
     calibration = msgspec.structs.replace(solved_real.calibration, posterior=None)
     quality = msgspec.structs.replace(
         calibration.quality, noise={"corner_px": 0.12, "robot_mm": 0.05, "robot_deg": 0.02}

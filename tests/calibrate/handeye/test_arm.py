@@ -12,7 +12,7 @@ from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye import cell_fit, estimate
 from calibrate.handeye.arm import arm_postures, flex_motion, gravity_in_flange
 from calibrate.handeye.cell_fit import fit_cell
-from calibrate.handeye.estimate import Estimate, MeanParts
+from calibrate.handeye.estimate import Estimate, MixtureParts
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import solve_views
 from calibrate.views import ViewSet
@@ -110,12 +110,12 @@ def test_the_region_of_an_average_holds_95_percent_of_it():
         "the bracket is rigid"
     )
     chances, widths = np.array([0.5, 0.3, 0.2]), np.array([0.2, 0.8, 3.3])
-    average = replace(found.estimate, mean_of=MeanParts(chances, widths))
+    average = replace(found.estimate, mixture=MixtureParts(chances, widths))
     rng, n = np.random.default_rng(0), 200_000
     freedom = 3 * average.chances[:, 0].sum() - 6
     drawn = rng.choice(widths, n, p=chances) * 6 * rng.f(6, freedom, n)
     assert np.mean(drawn <= average.threshold) == pytest.approx(0.95, abs=0.002)
-    assert average.threshold > 1.5 * replace(average, mean_of=MeanParts()).threshold
+    assert average.threshold > 1.5 * replace(average, mixture=MixtureParts()).threshold
 
 
 def test_noise_and_steps_are_those_of_the_fit_that_is_reported(monkeypatch):

@@ -30,6 +30,7 @@ def test_replies_of_the_dashboard(controller) -> None:
         "programState": "STOPPED <unnamed>",
         "stop": "Stopped",
         "power on": "could not understand: power on: not supported by this simulator",
+        (no := "unlock protective stop"): f"could not understand: {no}: not supported by this simulator",
         "is in remote control": "could not understand: is in remote control",
     }
     assert dashboard(controller("UR10").host, *questions) == [GREETING, *questions.values()]

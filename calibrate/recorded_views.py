@@ -127,8 +127,9 @@ def _told_views(
 
 
 def _board_view(view: View, points: Array, pixels: Array) -> BoardView:
-    joints, told = (None if of is None else np.array(of) for of in (view.joints_rad, view.camera_from_board))
-    return BoardView(view.index, view.name, np.array(view.base_from_flange), points, pixels, joints, told)
+    recorded = view.joints_rad, view.camera_from_board
+    joints, board = (None if numbers is None else np.array(numbers) for numbers in recorded)
+    return BoardView(view.index, view.name, np.array(view.base_from_flange), points, pixels, joints, board)
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:

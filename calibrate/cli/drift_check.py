@@ -244,8 +244,8 @@ def production_text(result: DriftCheck, pictures: int) -> str:
 def _more_text(result: DriftCheck, calibration: Calibration) -> str:
     if result.elsewhere:
         return (
-            "These poses lie outside the calibration's, where the arm may err otherwise by what is stated of "
-            "it. Check where it was calibrated."
+            "These poses lie outside the range of the calibration's, where the robot may err differently, by "
+            "its stated accuracy. Take poses inside that range."
         )
     if result.views_needed is not None:
         return (

@@ -83,12 +83,12 @@ def _print_info(facts: RecordingInfo) -> None:
     for name, value in _info_rows(facts):
         table.add_row(Text(name, _STYLES.get(name, "")), value)
     console.print(table)
-    topic = Column("topic", overflow="fold")
-    topics = Table(topic, "messages", "rate", "size", box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for told in facts.topics:
-        rate = f"{told.rate_hz:.1f} Hz" if told.rate_hz else "-"
-        name = told.topic + (" (of another program, ignored)" if told.foreign else "")
-        topics.add_row(name, str(told.messages), rate, f"{told.bytes / 1e6:.2f} MB")
+    names = Column("topic", overflow="fold")
+    topics = Table(names, "messages", "rate", "size", box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for topic in facts.topics:
+        rate = f"{topic.rate_hz:.1f} Hz" if topic.rate_hz else "-"
+        name = topic.topic + (" (of another program, ignored)" if topic.foreign else "")
+        topics.add_row(name, str(topic.messages), rate, f"{topic.bytes / 1e6:.2f} MB")
     console.print(topics)
 
 

@@ -16,6 +16,7 @@ from recordings.schema.messages import BoardSpec
 FEWEST_FOR_TREND = 5
 """Fewest drift checks from which a trend is estimated."""
 _TREND_P = 0.01
+"""Probability of a slope this clear by chance, below which a trend is reported."""
 
 
 def entry_of(

@@ -19,13 +19,14 @@ from recordings.schema.messages import CameraModel
 
 _STEPS = 60
 _SETTLED = 1e-9
-"""Relative gain after which the next step, by far smaller, is not worth taking: a thousandth of a sigma."""
+"""The fit has converged when a step lowers the squares by no more than this share of them: it was about a
+thousandth of a sigma, and the next would be far smaller."""
 _DAMPING, _LARGEST_DAMPING = 1e-9, 1e9
-"""The first and least one; and where a fit ends."""
+"""Levenberg-Marquardt's damping: at the start, which it never falls below, and where a view's fit ends."""
 _CORNER_PX = 0.3
-"""1σ of a corner against which the prior of the lens is weighed."""
+"""1σ of a corner that is assumed where corners and the prior of the lens are weighed against each other."""
 _FAR = 4.0
-"""Distance, in medians of its view, from which a corner loses weight."""
+"""A corner loses weight from this multiple of the median distance, in its view, from where the fit has it."""
 
 
 @dataclass(frozen=True, eq=False)

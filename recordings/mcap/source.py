@@ -14,7 +14,9 @@ from mcap.records import Message
 from recordings.mcap.records import MESSAGE_HEAD, RECORD_HEAD, parse_chunk
 
 UNPACKED_START = 1 << 60
+"""Address of the first unpacked chunk: beyond the end of any file."""
 _WINDOW_BYTES = 64 * 1024
+"""Bytes of the file that are read at once."""
 _HEAD_BYTES = RECORD_HEAD.size + MESSAGE_HEAD.size
 
 
@@ -29,12 +31,12 @@ class Source:
         self.descriptor = descriptor
         self.size_bytes = os.fstat(descriptor).st_size
         self._starts: list[int] = []
-        """Addresses of the unpacked chunks."""
+        """Addresses at which the chunks begin as if they were unpacked."""
         self._chunks: list[tuple[int, int]] = []
-        """(place in the file, length) of their content."""
+        """Of each its compressed content: (place in the file, length)."""
         self._next = UNPACKED_START
         self._block: tuple[int, bytes] = (0, b"")
-        """(address, bytes) of the file, or of a whole unpacked chunk."""
+        """What was read last: (address, bytes), a part of the file or a whole unpacked chunk."""
 
     def add_packed(self, offset: int, length: int, size_bytes: int) -> int:
         """Makes the compressed chunk at `offset` readable; returns the address of its first record."""

@@ -29,7 +29,9 @@ REPLACED_S = 0.1
 """Time after the end of our program within which another one that replaced it starts to play."""
 MAY_BE_REPLACED = ("program-ended", "watchdog", "off-path", "ended-short", "no-progress")
 NEWS_WAIT_S = 0.25
+"""Longest wait, after the control program ended, for a state that may tell why."""
 REMOTE_WAIT_S = 0.3
+"""Longest wait for the dashboard to say whether remote control is on."""
 
 
 async def cause_of_end(link: UrLink, child: ControlChild, error: RobotError) -> RobotError:

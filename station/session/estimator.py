@@ -17,6 +17,7 @@ from station.session.recording import stamps_now
 from station.session.threads import DISK
 
 _LOOK_BACK_S, _ESTIMATE_S = 120.0, 20.0
+"""Longest the worker may take: for all images from before a restart, and for one estimate."""
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +52,7 @@ class Estimator:
                 estimate = await context.workers.call(
                     running_estimate, config, camera, known, seen, timeout_s=_ESTIMATE_S
                 )
-                if context.cell.mover is None:  # its pose is told by people and their programs
+                if context.cell.mover is None:  # poses typed or posted may be wrong: look for one
                     odd = await context.workers.call(
                         odd_view, config.mount, config.board, camera, known, seen, timeout_s=_ESTIMATE_S
                     )

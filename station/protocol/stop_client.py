@@ -21,11 +21,13 @@ From a person to the wire, by files and functions in `station/` (tests/test_page
       ur_rtde, or of the station's own script, which gets an RTDE data packet (type "U") with the command
       STOP: stopj(4.0) where it moves, then halt. `devices/ur_child.py:ControlChild.stop, _send`,
       `devices/ur_control.py:MotionServer.serve`, `devices/ur_script.py:ScriptControl.stopJ`.
-  Where the dashboard does not answer "Stopped" within 50 ms it is asked again on a new connection. The
-    control process is killed after 50 ms, or once it answered; a program that it left playing is stopped.
+  Where the dashboard does not answer "Stopped" within 50 ms it is asked once more, on a new connection. The
+    control process is killed once it answered, at most 0.1 s after STOP; a program that it left playing is
+    stopped.
     `devices/ur.py:UrRobot._finish_stop, _dashboard_stop_anew, _stop_leftover_program`.
   Where the daemon hangs, no way above is left. Its session beats no more, the control process resets the
-    controller's watchdog only for a fresh beat, and the watchdog stops the arm in 0.2 s (decision 0045).
+    watchdog of the program at the controller only for a beat of the last 0.1 s, and 0.2 s after the last one
+    the watchdog stops the arm (decision 0045).
     `session/supervisor.py:SessionSupervisor._round`, `devices/ur_control.py:MotionServer._beat`.
   The same from the function named: the verb, `server/connections.py:_take`; Ctrl-C at a command,
     `cli/session.py:attended`; signals to the daemon, `daemon.py:Daemon.end`; a client in control that is

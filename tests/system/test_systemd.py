@@ -15,6 +15,7 @@ from calibrate.files.calibration import read_calibration
 from recordings.reader import open_recording
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
+from station.devices.rtde import RuntimeState
 from station.protocol.client import Client
 from tests.patience import until
 from tests.system.conftest import SystemRig, go, status_when
@@ -100,10 +101,10 @@ async def test_a_hung_daemon_is_killed_and_the_next_one_waits_for_a_person(
     await until(lambda: station.show("station", "ActiveState") == "active")
     assert station.show("station", "MainPID") != first
     async with await client_of(station) as anna:
-        status = await status_when(anna, lambda s: s.robot.connected)
+        status = await status_when(anna, lambda s: s.robot.state is not None)
         assert status.state is S.STOPPED
         assert status.cause == "interrupted"
-        assert not status.robot.control
+        assert status.robot.state.runtime_state != RuntimeState.PLAYING  # it began no control
         await rig.stays_at_rest(1.0)
         await anna.request("acknowledge")
         await anna.request("finish")

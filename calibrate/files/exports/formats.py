@@ -9,7 +9,8 @@ It is given the calibration and the names of frames. The camera's place is `cali
 the optical frame in its parent, (4, 4) in metres; its lens `calibration.intrinsics.model`. It returns the
 file's text, which holds `frames.comment` as a comment or a text of its own. A reader in
 tests/foreign/export_readers.py, by another library or that program's own rule, must find 500 known points
-where the calibration shows them.
+where the calibration shows them. Its library is pinned in tests/foreign/requirements.txt, with what it needs.
+XML is written with `models.commented` and `models.numbers`.
 """
 
 from __future__ import annotations

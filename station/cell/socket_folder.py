@@ -33,7 +33,8 @@ def default_socket() -> Path:
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     if runtime and _is_own(Path(runtime)):  # after `su` it may still be the other user's
         return Path(runtime) / "station-control.sock"
-    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    # Unlike Path.home, it does not fail for an account without a home: STOP then says that nothing listens.
+    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")  # noqa: PTH111
     return Path(state) / "calibration-station" / "run" / "control.sock"
 
 

@@ -166,7 +166,8 @@ class Run:
         todo = list(self._go.motion.poses)
         while not context.requests.halt:
             todo = [index for index in todo if index in queue.open]
-            if self._wants_rest() or not todo or self._failures >= FAILURES_IN_A_ROW:
+            asked = context.requests
+            if asked.pause_by or asked.finish or not todo or self._failures >= FAILURES_IN_A_ROW:
                 break
             index = todo.pop(0)
             await DISK.run(context.require_recording().require_space)
@@ -176,9 +177,6 @@ class Run:
             remaining_s = round((time.monotonic() - started_s) / taken * len(todo), 1)
             elapsed_s = round(context.require_recording().elapsed_s, 1)
             context.store.update_session(elapsed_s=elapsed_s, remaining_s=remaining_s)
-
-    def _wants_rest(self) -> bool:
-        return bool(self._context.requests.pause_by) or self._context.requests.finish
 
     async def _pose(self, index: int) -> None:
         context, queue = self._context, self._queue

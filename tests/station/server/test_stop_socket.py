@@ -327,6 +327,10 @@ def test_without_a_runtime_folder_the_socket_lies_where_nobody_else_can_be_first
     assert (tmp_path / "state") in default_socket().parents
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     assert (tmp_path / "state") in default_socket().parents
+    for name in ("XDG_STATE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    assert not default_socket().exists()  # for an account without a home STOP says that nothing listens
 
 
 # -- the page, the modes, the places ------------------------------------------------------------------------

@@ -18,10 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
-from mcap_protobuf.decoder import DecoderFactory
 
 FOLDER = Path(os.environ.get("STATION_FOREIGN", Path(__file__).parents[2] / ".foreign"))
 _TIMEOUT_S = 120
@@ -41,46 +37,6 @@ def library(module: str, program: str) -> Any:
         missing(program)
     finally:
         sys.path.pop(0)
-
-
-def mcap_python(path: Path) -> list[str]:
-    """The reference library: file order and log order, every checksum, every message by its own schema."""
-    findings: list[str] = []
-    channels: dict[int, Channel] = {}
-    schemas: dict[int, Schema] = {}
-    streamed = []
-    with path.open("rb") as stream:
-        for record in StreamReader(stream, validate_crcs=True).records:
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message):
-                channel = channels[record.channel_id]
-                streamed.append((channel.topic, record.log_time, record.sequence))
-                encoding, schema = channel.message_encoding, schemas.get(channel.schema_id)
-                decode = DecoderFactory().decoder_for(encoding, schema)
-                if decode is None or decode(record.data) is None:
-                    findings.append(f"{channel.topic} cannot be decoded by its own schema")
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        summary = reader.get_summary()
-        offsets = [index.chunk_start_offset for index in summary.chunk_indexes] if summary else []
-        if offsets != sorted(offsets):
-            findings.append("the chunk index is not in file order")
-        for log_order in (True, False):
-            found = [
-                (c.topic, m.log_time, m.sequence)
-                for _, c, m in reader.iter_messages(log_time_order=log_order)
-            ]
-            if sorted(found) != sorted(streamed):
-                findings.append(f"other messages by the index (log order: {log_order})")
-            times = [time_ns for _, time_ns, _ in found]
-            if log_order and times != sorted(times):
-                findings.append("log order goes backwards")
-        list(reader.iter_attachments())
-        list(reader.iter_metadata())
-    return findings
 
 
 def mcap_core(path: Path) -> list[str]:
@@ -119,4 +75,4 @@ def rerun_check(path: Path) -> list[str]:
     return bad
 
 
-JUDGES: dict[str, Judge] = {"mcap": mcap_python, "@mcap/core": mcap_core, "rerun": rerun_check}
+JUDGES: dict[str, Judge] = {"@mcap/core": mcap_core, "rerun": rerun_check}

@@ -38,6 +38,11 @@ def pair_loop_objective(pairs):
     return evaluate
 
 
+def test_the_settings_are_those_of_the_paper():
+    assert EvolutionSettings(population=30, factor=0.5, crossover=0.9, generations=100) == SETTINGS
+    np.testing.assert_array_equal(BOX, [np.pi / 2] * 3 + [1.0] * 3)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_same_seed_gives_the_same_X_by_form_and_by_pair_loops(seed):
     pairs, _ = paper_pairs(seed)

@@ -162,10 +162,6 @@ class RecordingSegment:
         except ShortFileError as error:
             raise self._corrupt(topic, address, "the file became shorter after it was opened") from error
 
-    def stored(self, topic: Topic) -> Iterator[Message]:
-        """A topic's messages as they are stored, in file order."""
-        return (self._read(topic, address) for address in self.messages(topic).addresses)
-
     def _message(self, topic: Topic, address: int, struct: type[S]) -> S:
         try:
             return decode(struct, self._read(topic, address).data)

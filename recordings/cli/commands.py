@@ -48,7 +48,12 @@ def export_command(
     """Write images and poses, or a ROS 2 bag."""
     from recordings.exporters.export import export_recording
 
-    print(f"{export_recording(open_recording(recording), output, to)} written")
+    opened = open_recording(recording)
+    written = export_recording(opened, output, to)
+    views = len(opened.views())
+    others = sum(len(segment.image_sequences()) for segment in opened.segments) - views
+    left_out = f"; {others} without a pose that counts left out" if others else ""
+    print(plain_text(f"{written} written: {views} images{left_out}"))
 
 
 def recover_command(

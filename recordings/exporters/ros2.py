@@ -1,13 +1,14 @@
 """A recording as a ROS 2 bag that can be played: written by `rosbags` (the extra `ros`), no ROS needed.
 
-An image, its CameraInfo and the flange's frame carry one stamp: that of mid-exposure, where the image
-belongs to a view. In between the flange's frame follows at 100 Hz, the joints at their full rate.
+The image of every view, its CameraInfo and the flange's frame carry one stamp, that of mid-exposure. In
+between the flange's frame follows at 100 Hz, the joints at their full rate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from heapq import merge
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,9 +18,7 @@ from recordings.errors import RecordingError
 from recordings.images import mosaic_encoding, raw_encoding
 from recordings.importers.messages import ros_types
 from recordings.reader import Recording
-from recordings.schema.definitions import PictureFacts
 from recordings.schema.messages import CameraModel, Matrix4, View
-from recordings.schema.topics import Topic
 from recordings.schema.viewing import base_from_flange, joint_names, quaternion_xyzw
 from recordings.segment import RecordingSegment
 
@@ -44,57 +43,26 @@ def write_ros2(recording: Recording, folder: Path) -> None:
     messages = _Messages()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
+    arm = chain.from_iterable(_arm(messages, segment) for segment in recording.segments)
     inner = folder / recording.info.name
     with Writer(inner, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
-        for segment in recording.segments:
-            for entry in _entries(messages, recording, segment):
-                kind = entry.message.__msgtype__
-                if entry.topic not in connections:
-                    connections[entry.topic] = writer.add_connection(
-                        entry.topic,
-                        kind,
-                        typestore=messages.store,
-                    )
-                data = messages.store.serialize_cdr(entry.message, kind)
-                writer.write(connections[entry.topic], entry.time_ns, data)
+        for entry in merge(arm, _images(messages, recording), key=lambda entry: entry.time_ns):
+            kind = entry.message.__msgtype__
+            if entry.topic not in connections:
+                connections[entry.topic] = writer.add_connection(entry.topic, kind, typestore=messages.store)
+            data = messages.store.serialize_cdr(entry.message, kind)
+            writer.write(connections[entry.topic], entry.time_ns, data)
     for path in inner.iterdir():
         path.rename(folder / path.name)
     inner.rmdir()
 
 
-def _entries(messages: _Messages, recording: Recording, segment: RecordingSegment) -> Iterator[_Entry]:
-    """List the entries in time order, without images that were taken again or back."""
-    counted = {view.picture_sequence: view for view in recording.views() if view.part == segment.info.part}
-    stored = {message.sequence: message.log_time for message in segment.stored(Topic.PICTURE_FACTS)}
-    facts = {facts.sequence: facts for facts in segment.image_facts()}
-    left_out = {view.picture_sequence for view in segment.views} - counted.keys()
-    times = {
-        number: _mid_exposure_ns(counted.get(number), facts[number], time_ns)
-        for number, time_ns in stored.items()
-        if number not in left_out
-    }
-    return merge(
-        _arm(messages, segment),
-        _images(messages, segment, times, facts, counted),
-        key=lambda entry: entry.time_ns,
-    )
-
-
-def _mid_exposure_ns(view: View | None, facts: PictureFacts, recorded_ns: int) -> int:
-    """Return the view's stamp, else the frame's own time, else when the frame was recorded."""
-    if view is not None and view.stamps.host_wall_ns:
-        return view.stamps.host_wall_ns
-    stamps = facts.stamps
-    if facts.time is None or not stamps.host_wall_ns:
-        return recorded_ns
-    return stamps.host_wall_ns + facts.time.host_monotonic_ns - stamps.host_monotonic_ns
-
-
 def _arm(messages: _Messages, segment: RecordingSegment) -> Iterator[_Entry]:
+    """Joints and the flange's frame; a segment's flange is that of its own TCP offset."""
     shown_ns = -FRAME_PERIOD_NS
-    for stored, state in zip(segment.stored(Topic.ROBOT_STATE), segment.robot_states(), strict=True):
-        time_ns = stored.log_time
+    for state in segment.robot_states():
+        time_ns = state.stamps.host_wall_ns or segment.info.created_wall_ns
         joints = messages.make(
             "sensor_msgs/msg/JointState",
             messages.header(time_ns, ""),
@@ -110,37 +78,30 @@ def _arm(messages: _Messages, segment: RecordingSegment) -> Iterator[_Entry]:
             yield _Entry(time_ns, "/tf", messages.frames("base", FLANGE_FRAME, T, time_ns))
 
 
-def _images(
-    messages: _Messages,
-    segment: RecordingSegment,
-    times: dict[int, int],
-    facts: dict[int, PictureFacts],
-    counted: dict[int, View],
-) -> Iterator[_Entry]:
-    for sequence, time_ns in sorted(times.items(), key=lambda item: item[1]):
-        if view := counted.get(sequence):
-            yield _Entry(
-                time_ns, "/tf", messages.frames("base", FLANGE_FRAME, view.base_from_flange, time_ns)
-            )
-        yield _Entry(time_ns, "/camera/camera_info", messages.camera_info(segment.info.camera, time_ns))
-        yield _image(messages, segment, sequence, facts[sequence].pixel_format, time_ns)
+def _images(messages: _Messages, recording: Recording) -> Iterator[_Entry]:
+    """The views by time; those of an import, which have none, a second apart as the recording has them."""
+    info = recording.info
+    timed = [
+        (view.stamps.host_wall_ns or info.created_wall_ns + view.index * _NS, view)
+        for view in recording.views()
+    ]
+    for time_ns, view in sorted(timed, key=lambda each: each[0]):
+        yield _Entry(time_ns, "/tf", messages.frames("base", FLANGE_FRAME, view.base_from_flange, time_ns))
+        yield _Entry(time_ns, "/camera/camera_info", messages.camera_info(info.camera, time_ns))
+        yield _image(messages, recording, view, time_ns)
 
 
-def _image(
-    messages: _Messages, segment: RecordingSegment, sequence: int, pixel_format: str, time_ns: int
-) -> _Entry:
-    header = messages.header(time_ns, OPTICAL_FRAME)
-    stored = segment.stored_image(sequence)
-    if stored is not None:
+def _image(messages: _Messages, recording: Recording, view: View, time_ns: int) -> _Entry:
+    header, image = messages.header(time_ns, OPTICAL_FRAME), recording.image(view)
+    if stored := recording.stored_image(view):
         file_format, file = stored[0], np.frombuffer(stored[1], np.uint8)
-        if mosaic := mosaic_encoding(pixel_format):
+        if mosaic := mosaic_encoding(image.pixel_format):
             file_format = f"{mosaic}; {file_format} compressed"  # as image_transport says it
         message = messages.make("sensor_msgs/msg/CompressedImage", header, file_format, file)
         return _Entry(time_ns, "/camera/image_raw/compressed", message)
-    image = segment.image(sequence)
     height, width = image.pixels.shape[:2]
     data = np.ascontiguousarray(image.pixels).view(np.uint8).ravel()
-    encoding = raw_encoding(image.pixels, pixel_format)
+    encoding = raw_encoding(image.pixels, image.pixel_format)
     message = messages.make(
         "sensor_msgs/msg/Image", header, height, width, encoding, 0, len(data) // height, data
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 from pathlib import Path
 
 import cv2
@@ -86,14 +87,16 @@ def test_an_image_of_a_format_that_names_no_file_is_written_as_png(small: Path, 
     assert {path.name for path in (out / "images").iterdir()} == {"000.png", "001.png", "002.png"}
 
 
-def test_what_a_person_took_back_stays_out_of_a_bag(tmp_path: Path) -> None:
+def test_images_of_no_pose_that_counts_stay_out_of_a_bag_and_their_number_is_told(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.image(make_picture(2))  # as where no board was found
         for index in range(2):
             writer.image(make_picture(index))
             writer.view(make_view(index))
         writer.view(msgspec.structs.replace(make_view(1), taken_back=True, attempt=2))
         writer.finish()
-    assert call(main, "export", tmp_path / "a.mcap", "--to", "ros2", "-o", tmp_path / "out").returncode == 0
+    done = call(main, "export", tmp_path / "a.mcap", "--to", "ros2", "-o", tmp_path / "out")
+    assert re.findall(r"\d+", done.stdout.removeprefix(str(tmp_path))) == ["1", "2"]
     bag = open_bag(tmp_path / "out")
     assert [topic.messages for topic in bag.topics.values() if topic.kind is Kind.IMAGE] == [1]
 

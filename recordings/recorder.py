@@ -1,8 +1,8 @@
 """The recorder of a running session: one thread owns the file, all others hand messages over and go on.
 
-Images and robot states are dropped, and counted, when the disk cannot keep up; views, events and
-attachments never are. Data reach the operating system after every image and at least every 0.1 s, the
-disk at every `sync` and at least every 0.5 s; the regular ones run beside the writing, which goes on.
+While the disk is busy messages wait in memory: robot states are dropped where 20,000 wait (40 s at 500 Hz),
+an image is refused where `IMAGES_LIMIT` do. Data reach the operating system after every image and at least
+every 0.1 s, the disk at every `sync` and at least every 0.5 s, or as fast as it can.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.errors import RecordingError, UnfinishedRecordingError, recover_line
+from recordings.errors import RecordingError
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
@@ -32,50 +32,34 @@ from recordings.schema.messages import (
 from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter
 
-QUEUE_LIMIT_BYTES = 256 * 1024 * 1024
-"""At 150 fps of 1280×1024 bytes 1.3 s, which a disk may hesitate for."""
 QUEUE_LIMIT_MESSAGES = 20_000
+IMAGES_LIMIT = 8
+"""Of the largest kind 288 MiB; a session waits for its image before it takes the next."""
 FLUSH_PERIOD_S = 0.1
 SYNC_PERIOD_S = 0.5
-_STATE_BYTES = 400
-_SMALL_BYTES = 1000
+T = TypeVar("T")
 
 
 class _Item(NamedTuple):
-    write: Callable[[], object]
-    size_bytes: int
-    done: Future[None] | None = None
-    """Resolved after a sync that follows the write."""
+    work: Callable[[], Any]
+    done: Future[Any] | None = None
+    """Resolved to what the work returns."""
 
 
 class Recorder:
-    """Thread-safe. The first write error is final: later calls raise it, futures fail with it.
+    """Thread-safe. The first write error is final: later calls raise it, futures fail with it."""
 
-    `dropped`: images and states lost to a full queue.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        info: SessionInfo,
-        *,
-        queue_limit_bytes: int = QUEUE_LIMIT_BYTES,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, path: Path, info: SessionInfo, *, clock: Callable[[], float] = time.monotonic) -> None:
         """Creates the file and starts the thread. Raises RecordingError."""
         self._writer = RecordingWriter(path, info)
         self.part_path = self._writer.part_path
-        self.dropped = 0
         self.error: RecordingError | None = None
-        self._queue_limit_bytes = queue_limit_bytes
         self._clock = clock
         self._queue: deque[_Item] = deque()
-        self._queued_bytes = 0
-        self._dropped_images: set[int] = set()
+        """Oldest first; that one is being written, and leaves when it is."""
+        self._room = threading.Semaphore(IMAGES_LIMIT)
         self._lock = threading.RLock()
         self._wake = threading.Condition(self._lock)
-        self._awaited: Future[None] | None = None
-        """Future of the item that is being written."""
         self._finished: Future[Path] | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -87,67 +71,56 @@ class Recorder:
         return self._thread.is_alive()
 
     def robot_state(self, state: RobotState) -> bool:
-        """False when it was dropped, or came after the end."""
-        return self._offer(lambda: self._writer.robot_state(state), _STATE_BYTES)
+        """False when it was dropped, or came after the end or an error."""
+        with self._lock:
+            if self._ended or self.error is not None or len(self._queue) >= QUEUE_LIMIT_MESSAGES:
+                return False
+            # Nobody is woken 500 times a second: it waits for the next flush.
+            self._queue.append(_Item(lambda: self._writer.robot_state(state)))
+            return True
 
-    def image(self, image: Image) -> bool:
-        """False when it was dropped: take it again. The array must not be changed afterwards."""
-        kept = self._offer(lambda: self._writer.image(image), image.pixels.nbytes)
-        if not kept:
-            self._dropped_images.add(image.sequence)
-        return kept
+    def image(self, image: Image) -> None:
+        """RecordingError where too many wait; wait for `sync`. The array must not be changed afterwards."""
+        if self.error is None and not self._room.acquire(blocking=False):
+            raise RecordingError("disk-too-slow", waiting=IMAGES_LIMIT)
+
+        def write() -> None:
+            self._writer.image(image)
+            self._room.release()
+
+        self._put(write)
 
     def view(self, view: View) -> None:
-        """Raises RecordingError when its image was dropped or an earlier write failed."""
-        if self.error is None and view.picture_sequence in self._dropped_images:
-            raise RecordingError("image-dropped", pose=view.index + 1)
-        self._put(_Item(lambda: self._writer.view(view), _SMALL_BYTES))
+        self._put(lambda: self._writer.view(view))
 
     def event(self, event: CaptureEvent) -> None:
-        self._put(_Item(lambda: self._writer.event(event), _SMALL_BYTES))
+        self._put(lambda: self._writer.event(event))
 
     def camera_model(self, model: CameraModel) -> None:
-        self._put(_Item(lambda: self._writer.camera_model(model), _SMALL_BYTES))
+        self._put(lambda: self._writer.camera_model(model))
 
     def corners(self, sequence: int, pixels: NDArray[np.float64]) -> None:
         """Detected corners (n, 2) of a recorded image, for viewers."""
-        marks = [Marks(pixels, DETECTED)]
-        if sequence not in self._dropped_images:
-            self._put(_Item(lambda: self._writer.marks(sequence, marks), _SMALL_BYTES))
+        self._put(lambda: self._writer.marks(sequence, [Marks(pixels, DETECTED)]))
 
     def frame(
         self, parent: str, child: str, parent_from_child: Matrix4, stamps: Stamps | None = None
     ) -> None:
         """Record a frame that stays where it is, for viewers."""
-        self._put(_Item(lambda: self._writer.frame(parent, child, parent_from_child, stamps), _SMALL_BYTES))
+        self._put(lambda: self._writer.frame(parent, child, parent_from_child, stamps))
 
     def attach(self, name: str, media_type: str, content: bytes) -> None:
-        self._put(_Item(lambda: self._writer.attach(name, media_type, content), len(content)))
+        self._put(lambda: self._writer.attach(name, media_type, content))
 
     def sync(self) -> Future[None]:
         """Resolves when everything handed over before is on the disk; fails with RecordingError."""
-        done: Future[None] = Future()
-        done.set_running_or_notify_cancel()  # nobody who stops waiting can cancel the writing
-        try:
-            self._put(_Item(lambda: None, 0, done))
-        except RecordingError as error:
-            done.set_exception(error)
-        return done
+        return self._promise(self._writer.sync)
 
     def finish(self) -> Future[Path]:
         """Finishes the file after all that was handed over before; the future is its path. Idempotent."""
         with self._lock:
             if self._finished is None:
-                self._finished = Future()
-                self._finished.set_running_or_notify_cancel()
-                if self.error is not None:
-                    self._finished.set_exception(self.error)
-                elif self._closing:
-                    path, rescue = self.part_path, recover_line(self.part_path)
-                    self._finished.set_exception(
-                        UnfinishedRecordingError(path=path, reason="the recorder was closed", rescue=rescue)
-                    )
-                self._wake.notify()
+                self._finished = self._promise(self._writer.finish)
             return self._finished
 
     def close(self) -> None:
@@ -157,34 +130,23 @@ class Recorder:
             self._wake.notify()
         self._thread.join()
 
-    def _offer(self, write: Callable[[], object], size_bytes: int) -> bool:
-        with self._lock:
-            if self._ended:
-                return False
-            full = (
-                self._queued_bytes + size_bytes > self._queue_limit_bytes
-                or len(self._queue) >= QUEUE_LIMIT_MESSAGES
-            )
-            if full or self.error is not None:
-                self.dropped += 1
-                return False
-            self._append(_Item(write, size_bytes))
-            if size_bytes > _STATE_BYTES:  # states wait for the next flush: no 500 wake-ups a second
-                self._wake.notify()
-            return True
+    def _promise(self, work: Callable[[], T]) -> Future[T]:
+        done: Future[T] = Future()
+        done.set_running_or_notify_cancel()  # nobody who stops waiting can cancel the writing
+        try:
+            self._put(work, done)
+        except RecordingError as error:
+            done.set_exception(error)
+        return done
 
-    def _put(self, item: _Item) -> None:
+    def _put(self, work: Callable[[], Any], done: Future[Any] | None = None) -> None:
         with self._lock:
             if self.error is not None:
                 raise self.error
             if self._ended:
                 raise RecordingError("closed", path=self._writer.path)
-            self._append(item)
+            self._queue.append(_Item(work, done))
             self._wake.notify()
-
-    def _append(self, item: _Item) -> None:
-        self._queue.append(item)
-        self._queued_bytes += item.size_bytes
 
     @property
     def _ended(self) -> bool:
@@ -202,56 +164,33 @@ class Recorder:
 
     def _work(self) -> None:
         flushed_s = synced_s = self._clock()
-        while (items := self._next()) is not None:
-            if items:
-                self._write(items)
+        while self._wait():
+            if self._queue:
+                item = self._queue[0]
+                result = item.work()
+                self._queue.popleft()
+                if item.done is not None:
+                    item.done.set_result(result)
+                    continue  # all is on the disk, or the file is finished
             now_s = self._clock()
             if now_s - synced_s >= SYNC_PERIOD_S:
-                self._writer.begin_sync()
-                flushed_s = synced_s = now_s
+                self._writer.sync()
+                flushed_s = synced_s = self._clock()  # a slow disk must not sync for every message
             elif now_s - flushed_s >= FLUSH_PERIOD_S:
                 self._writer.flush()
                 flushed_s = now_s
-        if self._finished is not None and not self._finished.done():
-            self._finished.set_result(self._writer.finish())
 
-    def _next(self) -> list[_Item] | None:
-        """Take the oldest items: states up to and including the first other item.
-
-        Another item may be large, or a caller may wait for it, so it is written before more are taken. Empty
-        when none came for a flush period; None when there will be no more.
-        """
-        items: list[_Item] = []
+    def _wait(self) -> bool:
+        """Wait for a message, at most a flush period. False when there will be no more."""
         with self._lock:
             if not self._queue and not self._ended:
                 self._wake.wait(FLUSH_PERIOD_S)
-            if not self._queue and self._ended:
-                return None
-            while self._queue:
-                item = self._queue.popleft()
-                self._queued_bytes -= item.size_bytes
-                items.append(item)
-                if item.size_bytes != _STATE_BYTES:
-                    break
-        return items
-
-    def _write(self, items: list[_Item]) -> None:
-        self._awaited = items[-1].done
-        for item in items:
-            item.write()
-        if self._awaited is not None:
-            self._writer.sync()
-            self._awaited.set_result(None)
-        self._awaited = None
+            return bool(self._queue) or not self._ended
 
     def _fail(self, error: RecordingError) -> None:
         with self._lock:
             self.error = error
-            futures = [self._awaited, *(item.done for item in self._queue)]
+            waiting = [item.done for item in self._queue if item.done is not None]
             self._queue.clear()
-            self._queued_bytes = 0
-            if self._finished is not None and not self._finished.done():
-                self._finished.set_exception(error)
-        for future in futures:
-            if future is not None:
-                future.set_exception(error)
+        for done in waiting:
+            done.set_exception(error)

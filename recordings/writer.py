@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -79,7 +78,6 @@ class RecordingWriter:
         """The session's facts, written at the file's beginning; empty once `_copy_session` did it again."""
         self._file = OutputFile(self.part_path)
         self._mcap = self._file.writer()
-        self._background = BackgroundSync(self._file.descriptor)
         try:
             self._mcap.start(library="calibration-station")
             self._mcap.add_metadata(SESSION_RECORDS[0], self._session)
@@ -202,28 +200,23 @@ class RecordingWriter:
             self._mcap.flush()
 
     def sync(self) -> None:
-        """Everything so far is on the disk when this returns: survives a power loss."""
-        self.flush()
-        with self._disk():
-            self._background.begin()
-            self._background.wait()
+        """Everything so far is on the disk when this returns: survives a power loss.
 
-    def begin_sync(self) -> None:
-        """Like `sync` but does not wait for the disk. Does nothing while one runs.
-
-        Its error is raised by the next `begin_sync`, `sync` or `finish`.
+        Then all but the newest part leaves the page cache: gigabytes there, which nobody read, once made the
+        daemon fall silent for tenths of a second.
         """
         self.flush()
         with self._disk():
-            if not self._background.busy:
-                self._background.begin()
+            getattr(os, "fdatasync", os.fsync)(self._file.descriptor)  # macOS has no fdatasync
+            surplus = self._file.size_bytes - KEPT_IN_MEMORY_BYTES
+            if surplus > 0 and hasattr(os, "posix_fadvise"):  # a length of 0 would mean all of it
+                os.posix_fadvise(self._file.descriptor, 0, surplus, os.POSIX_FADV_DONTNEED)
 
     def finish(self) -> Path:
         """Finishes the file, renames it, and returns its final path."""
         with self._disk():
             self._copy_session()
             self._mcap.finish()
-            self._background.wait()
             os.fsync(self._file.descriptor)
             rename_new(self.part_path, self.path)
         self.close()
@@ -296,42 +289,3 @@ def derived_recording(path: Path, info: SessionInfo) -> Iterator[RecordingWriter
         raise
     finally:
         writer.close()
-
-
-class BackgroundSync:
-    """fdatasync of one open file in a thread; its error is raised by the next call.
-
-    Then all but the newest `KEPT_IN_MEMORY_BYTES` leave the page cache: gigabytes there, which nobody read,
-    once made the daemon fall silent for tenths of a second.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._thread: threading.Thread | None = None
-        self._error: OSError | None = None
-
-    @property
-    def busy(self) -> bool:
-        return self._thread is not None and self._thread.is_alive()
-
-    def begin(self) -> None:
-        """Waits for the one before. OSError when that failed."""
-        self.wait()
-        self._thread = threading.Thread(target=self._sync, name="recorder sync", daemon=True)
-        self._thread.start()
-
-    def wait(self) -> None:
-        """Wait until none runs. OSError when one failed: what it should have kept may be lost."""
-        if self._thread is not None:
-            self._thread.join()
-        if self._error is not None:
-            raise self._error
-
-    def _sync(self) -> None:
-        try:
-            getattr(os, "fdatasync", os.fsync)(self._descriptor)  # macOS has no fdatasync
-            surplus = os.fstat(self._descriptor).st_size - KEPT_IN_MEMORY_BYTES
-            if surplus > 0 and hasattr(os, "posix_fadvise"):  # a length of 0 would mean all of it
-                os.posix_fadvise(self._descriptor, 0, surplus, os.POSIX_FADV_DONTNEED)
-        except OSError as error:
-            self._error = error

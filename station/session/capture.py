@@ -125,7 +125,7 @@ async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState
 async def _write(context: SessionContext, index: int, image: Image, view: View, unchecked: bool) -> None:
     """Write the image while the board is detected; write the view, and count the pose, only with a board."""
     recording, queue = context.require_recording(), context.loaded()
-    recording.image(image)
+    recording.require_open().image(image)
     sighting = await _sighting(context, image, index)
     unusable = _unusable(sighting, unchecked)
     if sighting is not None and len(sighting.pixels):

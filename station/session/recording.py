@@ -197,12 +197,6 @@ class SessionRecording:
         self._sequence += 1
         return numbered
 
-    def image(self, image: Image) -> None:
-        """Queue an image for writing. RecordingError when the disk cannot keep up or has failed."""
-        recorder = self.require_open()
-        if not recorder.image(image):
-            raise recorder.error or RecordingError("disk-too-slow")
-
     async def sync(self) -> None:
         """Wait until everything queued is on the disk (fdatasync). Raises RecordingError."""
         try:

@@ -1,4 +1,4 @@
-"""The recorder: acknowledged means on the disk, drops are counted, the first error is the last."""
+"""The recorder: acknowledged means on the disk, memory is bounded, the first error is the last."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import errno
 import os
 import threading
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -56,9 +55,9 @@ def gate(monkeypatch: pytest.MonkeyPatch) -> Gate:
     return Gate(monkeypatch)
 
 
-def held_up(gate: Gate, folder: Path, **options: Any) -> Recorder:
+def held_up(gate: Gate, folder: Path) -> Recorder:
     """A recorder whose writer waits at the gate."""
-    recorder = Recorder(folder / "a.mcap", make_info(), **options)
+    recorder = Recorder(folder / "a.mcap", make_info())
     recorder.event(event())
     assert gate.reached.wait(PATIENCE_S)
     return recorder
@@ -74,7 +73,7 @@ def test_a_session_from_several_threads_comes_back_complete(tmp_path: Path) -> N
     robot = threading.Thread(target=send_states)
     robot.start()
     for index in range(10):
-        assert recorder.image(make_picture(index))
+        recorder.image(make_picture(index))
         recorder.view(make_view(index))
         recorder.sync().result(PATIENCE_S)
     robot.join()
@@ -84,7 +83,6 @@ def test_a_session_from_several_threads_comes_back_complete(tmp_path: Path) -> N
     assert [view.index for view in recording.views()] == list(range(10))
     for view, picture in recording.images():
         np.testing.assert_array_equal(picture.pixels, make_image(view.index))
-    assert recorder.dropped == 0
 
 
 def test_sync_resolves_only_after_fdatasync_of_what_came_before(
@@ -143,78 +141,70 @@ def test_what_a_sync_was_asked_for_has_left_the_process(tmp_path: Path) -> None:
         assert encode(make_state(3)) in writer.part_path.read_bytes()
 
 
-class SlowSync:
-    """A disk that takes its time for every fdatasync: until it is opened; then it may fail."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, failure: OSError | None = None) -> None:
-        self.opened, self.reached = threading.Event(), threading.Event()
-        self._failures = [failure] if failure is not None else []
-        monkeypatch.setattr(os, "fdatasync", self._sync)
-
-    def _sync(self, _: int) -> None:
-        self.reached.set()
-        assert self.opened.wait(PATIENCE_S)
-        if self._failures:
-            raise self._failures.pop()  # as the kernel does: it tells an error once
-
-
-def test_pictures_go_on_while_the_disk_syncs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    now_s = 0.0
-    disk = SlowSync(monkeypatch)
-    recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
-    now_s = recorder_module.SYNC_PERIOD_S * 1.01
-    assert disk.reached.wait(PATIENCE_S)
-    size, sequence = recorder.part_path.stat().st_size, 0
-    for sequence in range(3):
-        now_s += recorder_module.SYNC_PERIOD_S * 1.01
-        recorder.image(make_picture(sequence))
-    wait_until(lambda: recorder.part_path.stat().st_size > size + 3 * make_picture(0).pixels.nbytes)
-    recorder.view(make_view(2))
-    acknowledged = recorder.sync()
-    assert not acknowledged.done()
-    disk.opened.set()
-    acknowledged.result(PATIENCE_S)
-    recorder.close()
-
-
 def test_nothing_is_acknowledged_after_a_regular_sync_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_s = 0.0
-    disk = SlowSync(monkeypatch, OSError(5, "Input/output error"))
+    failures = [OSError(5, "Input/output error")]
+
+    def fdatasync(descriptor: int) -> None:
+        if failures:
+            raise failures.pop()  # as the kernel does: it tells an error once
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
+    recorder.image(make_picture(0))
+    now_s = recorder_module.SYNC_PERIOD_S * 1.01
+    wait_until(lambda: not recorder.alive)
+    for ask in (recorder.sync, recorder.finish):
+        with refused("disk", errno=errno.EIO):
+            ask().result(PATIENCE_S)
+
+
+def test_a_disk_that_takes_seconds_for_every_sync_costs_no_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s, syncs = 0.0, 0
+    reached, opened = threading.Event(), threading.Event()
+
+    def fdatasync(descriptor: int) -> None:
+        nonlocal now_s, syncs
+        reached.set()
+        assert opened.wait(PATIENCE_S)
+        now_s, syncs = now_s + 4.0, syncs + 1
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
     recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
     now_s = recorder_module.SYNC_PERIOD_S * 1.01
-    assert disk.reached.wait(PATIENCE_S)
-    acknowledged = recorder.sync()  # its own fdatasync would succeed
-    disk.opened.set()
-    with refused("disk", errno=errno.EIO):
-        acknowledged.result(PATIENCE_S)
-    assert recorder.error is not None
-
-
-def test_a_slow_disk_costs_counted_pictures_and_never_a_view(gate: Gate, tmp_path: Path) -> None:
-    size = make_picture(0).pixels.nbytes
-    recorder = held_up(gate, tmp_path, queue_limit_bytes=3 * size + 500)
-    kept = [recorder.image(make_picture(sequence)) for sequence in range(5)]
-    assert kept == [True, True, True, False, False]
-    assert recorder.dropped == 2
-    recorder.view(make_view(0))
-    with refused("image-dropped"):
-        recorder.view(make_view(4))
-    gate.opened.set()
+    assert reached.wait(PATIENCE_S)
+    assert all(recorder.robot_state(make_state(count)) for count in range(2000))
+    opened.set()
     recording = open_recording(recorder.finish().result(PATIENCE_S))
-    assert recording.segments[0].image_sequences() == [0, 1, 2]
-    assert [view.index for view in recording.views()] == [0]
+    assert list(recording.robot_states()) == [make_state(count) for count in range(2000)]
+    assert syncs == 1, "it would write a message for every 4 s"
+
+
+def test_images_for_which_nobody_waits_do_not_fill_the_memory(gate: Gate, tmp_path: Path) -> None:
+    recorder = held_up(gate, tmp_path)
+    for sequence in range(recorder_module.IMAGES_LIMIT):
+        recorder.image(make_picture(sequence))
+    with refused("disk-too-slow"):
+        recorder.image(make_picture(recorder_module.IMAGES_LIMIT))
+    gate.opened.set()
+    recorder.sync().result(PATIENCE_S)
+    recorder.image(make_picture(recorder_module.IMAGES_LIMIT))
+    recording = open_recording(recorder.finish().result(PATIENCE_S))
+    assert recording.segments[0].image_sequences() == list(range(recorder_module.IMAGES_LIMIT + 1))
 
 
 def test_the_callers_never_wait_for_the_disk(gate: Gate, tmp_path: Path) -> None:
     recorder = held_up(gate, tmp_path)
-    for count in range(recorder_module.QUEUE_LIMIT_MESSAGES + 7):  # returns although nothing is written
-        recorder.robot_state(make_state(count))
+    limit = recorder_module.QUEUE_LIMIT_MESSAGES - 1  # beside the event that is being written
+    kept = [recorder.robot_state(make_state(count)) for count in range(limit + 7)]
+    assert kept == [True] * limit + [False] * 7
     recorder.event(event())
     done = recorder.sync()
     assert not done.done()
-    assert recorder.dropped == 7
     gate.opened.set()
     done.result(PATIENCE_S)
     recorder.close()
@@ -234,8 +224,9 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
         recorder.sync().result(PATIENCE_S)
     assert recorder.error is not None
     monkeypatch.undo()  # space is free again, and still nothing more is written
-    assert not recorder.image(make_picture(2))
+    assert not recorder.robot_state(make_state(0))
     for call in (
+        lambda: recorder.image(make_picture(2)),
         lambda: recorder.view(make_view(2)),
         lambda: recorder.event(event()),
         lambda: recorder.sync().result(PATIENCE_S),
@@ -295,25 +286,5 @@ def test_closing_leaves_the_part_file_for_recovery(tmp_path: Path) -> None:
     assert recorder.part_path.exists()
     with refused("closed"):
         recorder.event(event())
-    with refused("unfinished-recording"):
+    with refused("closed"):
         recorder.finish().result(PATIENCE_S)
-
-
-def test_what_comes_with_the_end_while_the_thread_looks_up_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The thread once left when the end had come since it had found nothing."""
-    look, finished = Recorder._next, []
-
-    def next_items(recorder: Recorder) -> object:
-        items = look(recorder)
-        if items == [] and not finished:
-            recorder.attach("plan.yaml", "application/yaml", b"poses: []")
-            finished.append(recorder.finish())
-        return items
-
-    monkeypatch.setattr(Recorder, "_next", next_items)
-    recorder = Recorder(tmp_path / "r.mcap", make_info())
-    wait_until(lambda: finished)
-    assert open_recording(finished[0].result(60)).attachments() == {"plan.yaml": b"poses: []"}
-    recorder.close()

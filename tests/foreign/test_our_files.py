@@ -60,17 +60,12 @@ def test_nobody_finds_anything(tmp_path: Path, kind: str, judge: str) -> None:
     assert JUDGES[judge](FILES[kind](tmp_path)) == []
 
 
-def test_the_judges_see_what_is_wrong(tmp_path: Path) -> None:
-    """A judge that is always content would be none."""
+@pytest.mark.parametrize("judge", JUDGES)
+def test_a_judge_sees_what_is_wrong(tmp_path: Path, judge: str) -> None:
+    """One that is always content would be none."""
     path = fresh(tmp_path)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-    for name in JUDGES:
-        try:
-            assert JUDGES[name](path), name
-        except pytest.skip.Exception:
-            continue
+    path.write_bytes(path.read_bytes()[:-3000])
+    assert JUDGES[judge](path)
 
 
 def test_rerun_draws_pictures_frames_and_events_without_a_plugin(tmp_path: Path) -> None:

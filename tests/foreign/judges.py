@@ -30,13 +30,12 @@ def missing(program: str) -> None:
 
 def library(module: str, program: str) -> Any:
     """A Python module of somebody else's; skips where it is not installed."""
-    sys.path.insert(0, str(FOLDER / "python"))
+    if (folder := str(FOLDER / "python")) not in sys.path:
+        sys.path.append(folder)  # for good: some load their parts when they need them
     try:
         return import_module(module)
     except ImportError:
         missing(program)
-    finally:
-        sys.path.pop(0)
 
 
 def mcap_core(path: Path) -> list[str]:

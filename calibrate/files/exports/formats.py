@@ -8,9 +8,9 @@ short example; one with names of frames is `ros.ros_launch`. A new module is imp
 It is given the calibration and the names of frames. The camera's place is `calibration.transform.matrix`,
 the optical frame in its parent, (4, 4) in metres; its lens `calibration.intrinsics.model`. It returns the
 file's text, which holds `frames.comment` as a comment or a text of its own. A reader in
-tests/foreign/export_readers.py, by another library or that program's own rule, must find 500 known points
-where the calibration shows them. Its library is pinned in tests/foreign/requirements.txt, with what it needs.
-XML is written with `models.commented` and `models.numbers`.
+`READERS` of tests/calibrate/files/test_exports.py finds the camera's place by the other program's own rule.
+A library that reads the format judges it in tests/foreign/test_exports.py and is pinned in its
+requirements.txt. XML is written with `models.commented` and `models.numbers`.
 """
 
 from __future__ import annotations

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -25,13 +27,12 @@ from calibrate.files.calibration import (
 )
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
-from calibrate.geometry import Array, FrameMismatchError, Transform, pose, rotation_exp
+from calibrate.geometry import Array, FrameMismatchError, Transform, inverse, pose, rotation_exp
 from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, DhTable, RobotModel, forward, table_of_axes, with_near_axes
 from calibrate.recorded_views import arm_of_ros
 from recordings.schema.messages import RobotIdentity
 from tests.codes import raises
-from tests.foreign.export_readers import READERS
 
 
 def export(calibration: Calibration, name: str, frames: FrameNames | None = None) -> str:
@@ -140,7 +141,46 @@ def same(found: Array, calibration: Calibration, tolerance: float = 1e-12) -> No
     assert np.abs(found - calibration.transform.matrix).max() < tolerance
 
 
+def ros_launch(text: str) -> Array:
+    """The words of tf2_ros's static_transform_publisher."""
+    words = ast.literal_eval(re.search(r"arguments=(\[.*?\])", text, re.DOTALL)[1])
+    said = dict(zip(words[::2], words[1::2], strict=True))
+    assert said["--frame-id"] in ("tool0", "base")
+    assert said["--child-frame-id"] == "camera_calibrated_optical_frame"
+    R = Rotation.from_quat([float(said[f"--q{axis}"]) for axis in "xyzw"]).as_matrix()
+    return pose(R, [float(said[f"--{axis}"]) for axis in "xyz"])
+
+
+def halcon(text: str) -> Array:
+    """read_pose: f 0 is 'Rp+T', 'gba', 'point': R = Rx Ry Rz, degrees and metres; points into the camera."""
+    read = {line[0]: line[1:].split() for line in text.splitlines() if line[:1] in ("f", "r", "t")}
+    assert read["f"] == ["0"]
+    R = Rotation.from_euler("XYZ", [float(v) for v in read["r"]], degrees=True).as_matrix()
+    return inverse(pose(R, [float(v) for v in read["t"]]))
+
+
+def zivid(text: str) -> Array:
+    """Millimetres."""
+    matrix = np.array(yaml.safe_load(text)["FloatMatrix"]["Data"])
+    return pose(matrix[:3, :3], matrix[:3, 3] / 1000)
+
+
+READERS: dict[str, Callable[[str], Array]] = {"ros-launch": ros_launch, "halcon": halcon, "zivid": zivid}
+"""Format → its reader's own rule for the camera's place in its parent frame, (4, 4) in metres."""
+BY_A_TEST = {"opencv", "ros-camera-info", "ur-kinematics", "urdf"}
+"""Formats that hold more than a place; each has a test of its own here, some another in tests/foreign."""
+
+
 @pytest.mark.parametrize("name", READERS)
+def test_the_camera_is_where_the_calibration_has_it(calibration: Calibration, name: str) -> None:
+    same(READERS[name](export(calibration, name)), calibration)
+
+
+def test_every_format_has_a_reader() -> None:
+    assert set(READERS) | BY_A_TEST == set(FORMATS)
+
+
+@pytest.mark.parametrize("name", sorted(set(FORMATS) - {"ur-kinematics"}))
 def test_beside_a_table_it_is_said_for_which_arm_the_pose_is(calibration: Calibration, name: str) -> None:
     bare = msgspec.structs.replace(calibration, arm_table=None)
     note = "not for the corrected arm"

@@ -129,7 +129,7 @@ def linearise_corners(
         chunk = observed.part(np.arange(n)[part])
         points = chunk.points if shape is None else bent_points(chunk, shape)
         turned, p = _in_camera(chunk, points, C[part])
-        projected = project(camera, p, with_intrinsics=with_lens)
+        projected = project(camera, p)
         root = np.sqrt(weights[part] * chunk.present)[..., None]
         r = ((chunk.pixels - projected.pixels) * root).reshape(len(chunk), -1)
         L = np.concatenate([projected.by_point, projected.by_point @ -skew(turned)], axis=-1)
@@ -138,7 +138,7 @@ def linearise_corners(
         blocks.LL[part] = L_t @ L
         blocks.Lr[part] = (L_t @ r[..., None])[..., 0]
         blocks.rr[part] = (r * r).sum(axis=1)
-        columns = [] if projected.by_intrinsics is None else [projected.by_intrinsics]
+        columns = [projected.by_intrinsics] if with_lens else []
         if shape is not None:
             columns.append(projected.by_point @ (C[part, None, :3, :3] @ _by_shape(chunk)))
         if columns:

@@ -37,8 +37,10 @@ LENSES = {
         PAPER_CAMERA, distortion=(0.03, -0.01, 0.003, 0.0), distortion_model="equidistant"
     ),
 }
-LENSES["of eight numbers"] = msgspec.structs.replace(
-    LENSES["rational_polynomial"], distortion_model="plumb_bob"
+LENSES["of eight numbers, skewed"] = msgspec.structs.replace(
+    LENSES["rational_polynomial"],
+    distortion_model="plumb_bob",
+    matrix=((1650.0, 20.0, 640.0), (0.0, 1680.0, 500.0), (0.0, 0.0, 1.0)),
 )
 
 

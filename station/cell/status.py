@@ -242,8 +242,6 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     remaining_s: float | None = None
     recording: str = ""
     """Path of the finished recording; empty: not finished yet."""
-    approved_again: int = 0
-    """How often a simulated cell approved the rest of the session itself, after late robot states."""
     check: bool = False
     """True: a drift check, to be compared with the installed calibration, not to be solved."""
 

@@ -56,7 +56,7 @@ class DemoJson(msgspec.Struct, frozen=True):
     report: str
     gates_passed: bool
     approved_again: int
-    """How often the cell approved the rest by itself, after news that came late."""
+    """How often the command approved the rest again, after robot states that came late."""
 
 
 def demo_command(
@@ -96,7 +96,7 @@ def demo_command(
     folder.mkdir(parents=True, exist_ok=True)
     served = ["--simulate", "--root", str(folder), *arguments]
     with own_daemon(served, folder / "daemon.log") as socket:
-        outcome = asyncio.run(_captured(socket, plan, quiet))
+        outcome, approved_again = asyncio.run(_captured(socket, plan, quiet))
     if outcome.session.recording and not quiet:
         err.print("Solving …", style="dim")
     solved, made = _solved(outcome), Path(outcome.session.folder)
@@ -117,7 +117,7 @@ def demo_command(
         calibration=str(made / CALIBRATION_FILE),
         report=str(made / REPORT_FILE),
         gates_passed=all(gate.passed for gate in solved.quality.gates),
-        approved_again=outcome.session.approved_again,
+        approved_again=approved_again,
     )
     if as_json:
         print_json(result)
@@ -149,10 +149,11 @@ def _show_demo(result: DemoJson, solved: Calibration, arm_is_corrected: bool, du
         out.print(f"{name:<12} {getattr(result, name)}")
 
 
-async def _captured(socket: Path, plan: MakePlan, quiet: bool) -> StationStatus:
+async def _captured(socket: Path, plan: MakePlan, quiet: bool) -> tuple[StationStatus, int]:
+    """The session at its end, and how often it was approved again."""
     async with attended(socket, headless=True, quiet=quiet) as shell:
         await shell.client.call(plan, timeout_s=PLAN_S)
-        return await shell.carry_out(Purpose.RUN)
+        return await shell.carry_out(Purpose.RUN), shell.approved_again
 
 
 def _solved(outcome: StationStatus) -> Calibration:

@@ -42,8 +42,6 @@ class Cell:
     """Plan to load at the start: the recorded poses of a played-back cell."""
     ended: Callable[[], None] = lambda: None
     """Called after the devices are closed, to end the processes of a simulated cell."""
-    own_simulator: bool = False
-    """True where this very process started what moves: only there it may approve motion by itself."""
 
     @property
     def simulated(self) -> bool:

@@ -17,7 +17,7 @@ from station.cell.errors import RefusedError, StationError
 from station.cell.pose_plan import Criterion
 from station.cell.status import MotionPreview, StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
-from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakePlan, Prepare
+from station.protocol.verbs import PLANNED_ELSEWHERE, GetPlan, Go, MakePlan, Prepare
 
 Watcher = Callable[[StationStatus], None]
 Approve = Callable[[MotionPreview], Awaitable[bool]]
@@ -99,16 +99,8 @@ def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
     ]
 
 
-async def watched(link: Client, watch: Watcher, finish_with_loss: bool = False) -> StationStatus:
-    """Watch a session until it ends or pauses; `finish_with_loss`: finish it although poses failed."""
-    status = await _until_rest(link, watch)
-    if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
-        await link.call(Finish())
-        status = await _until_rest(link, watch)
-    return status
-
-
-async def _until_rest(link: Client, watch: Watcher) -> StationStatus:
+async def until_rest(link: Client, watch: Watcher) -> StationStatus:
+    """Watch a session until it ends or pauses."""
     async for status in link.statuses():
         watch(status)
         if status.state in _RESTING:

@@ -5,9 +5,8 @@
                       │  └──── sealing <─────────┴────────────────────────────────────┤
                       └── acknowledge ── stopped, fault          paused <─────────────┘
 
-`moving` is entered from rest by an approval only, through `checking`. A simulated cell that was
-late goes back to `checking` by itself, with an approval of its own. `stopped` and `fault` are left by a
-person's acknowledgement and, `fault`, by STOP. A touch test and a stop test lead from `moving` to `idle`.
+`moving` is entered from rest by an approval only, through `checking`. `stopped` and `fault` are left by a
+person's acknowledgement and, `fault`, by STOP. A stop test leads from `moving` to `idle`.
 """
 
 from __future__ import annotations
@@ -20,11 +19,10 @@ TRANSITIONS: dict[S, frozenset[S]] = {
     S.DISCONNECTED: frozenset({S.IDLE, S.PAUSED}) | LATCHED,
     S.IDLE: frozenset({S.CHECKING, S.FREE_DRIVE, S.PAUSED, S.DISCONNECTED}) | LATCHED,
     S.CHECKING: frozenset({S.MOVING, S.IDLE, S.PAUSED, S.SEALING}) | LATCHED,
-    S.MOVING: frozenset({S.CHECKING, S.SETTLING, S.PAUSED, S.IDLE, S.SEALING}) | LATCHED,
-    S.SETTLING: frozenset({S.CHECKING, S.CAPTURING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE}) | LATCHED,
-    S.CAPTURING: frozenset({S.CHECKING, S.WRITING, S.SETTLING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE})
-    | LATCHED,
-    S.WRITING: frozenset({S.CHECKING, S.SETTLING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE}) | LATCHED,
+    S.MOVING: frozenset({S.SETTLING, S.PAUSED, S.IDLE, S.SEALING}) | LATCHED,
+    S.SETTLING: frozenset({S.CAPTURING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE}) | LATCHED,
+    S.CAPTURING: frozenset({S.WRITING, S.SETTLING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE}) | LATCHED,
+    S.WRITING: frozenset({S.SETTLING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE}) | LATCHED,
     S.SEALING: frozenset({S.IDLE, S.PAUSED}) | LATCHED,
     S.PAUSED: frozenset({S.CHECKING, S.SEALING, S.FREE_DRIVE, S.IDLE}) | LATCHED,
     S.STOPPED: frozenset({S.IDLE, S.PAUSED, S.DISCONNECTED}),

@@ -160,7 +160,6 @@ class SessionContext:
             name="",
             folder="",
             recording="",
-            approved_again=0,
             check=check,
             elapsed_s=0.0,
             remaining_s=None,

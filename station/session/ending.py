@@ -52,8 +52,6 @@ async def _seal(context: SessionContext) -> None:
     # The most important first, as a narrow screen cuts the end.
     poses = len(queue.statuses)
     text = f"finished with {queue.done} of {poses} poses: {path}"
-    if again := context.store.status.session.approved_again:
-        text += f" (approved again by itself {again} time{'s' * (again > 1)}: news came late)"
     context.store.event("finished", text, captured=queue.done, poses=poses, path=str(path))
     if context.store.state in (StationState.SEALING, StationState.PAUSED):
         context.store.enter(StationState.IDLE)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,12 +17,10 @@ from station.cell.limits import check_path, with_plan_speeds
 from station.cell.status import Event, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError
 from station.devices.base import fresh
-from station.devices.news import Delay
-from station.protocol.verbs import Purpose
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
 from station.session.ending import failed, seal, unmark_busy
-from station.session.motion import Motion, MotionApproval, offered, require_start
+from station.session.motion import MotionApproval, require_start
 from station.session.stop_move import stop_half_way
 from station.session.threads import DISK, MOTION
 
@@ -32,8 +29,6 @@ log = logging.getLogger(__name__)
 ARRIVED_RAD = 1e-4
 """Distance to the target within which no move is made."""
 FAILURES_IN_A_ROW = 3
-APPROVED_AGAIN = 3
-"""Times that a simulated cell goes on by itself under one approval of a person."""
 
 
 class Run:
@@ -44,7 +39,6 @@ class Run:
         self._go = go
         self._queue = go.motion.queue
         self._geometry = with_plan_speeds(cell_geometry(context.cell.config), self._queue.plan)
-        self._approved_again = 0
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
         """Numbers of poses that did not settle."""
@@ -52,15 +46,11 @@ class Run:
     async def drive(self) -> None:
         """Carry out the approval, ending in paused, stopped, fault or idle; raises only when cancelled."""
         try:
-            while (late := await self._drive_once()) is not None:
-                if not await self._approve_again(late):
-                    failed(self._context, late)
-                    return
+            await self._drive_once()
         finally:  # whoever waits for its end may begin the next
             unmark_busy(self._context)
 
-    async def _drive_once(self) -> StationError | None:
-        """Carry out the approval once; return the error of a delay after which it may go on, else None."""
+    async def _drive_once(self) -> None:
         try:
             if await self._begin():
                 await self._motion()
@@ -68,47 +58,9 @@ class Run:
             failed(self._context, error)  # the controller itself stopped the arm
         except Exception as error:
             await self._mover.stop(str(error))
-            if isinstance(error, StationError) and self._may_go_on(error):
-                return error
             failed(self._context, error)
         finally:
             await self._mover.end_control()
-        return None
-
-    def _may_go_on(self, error: StationError | RecordingError) -> bool:
-        """Tell whether the run may go on by itself after an error.
-
-        Only after a delay of known cause, in a cell whose simulator this program started, and unless a person
-        or the controller stopped the arm.
-        """
-        late = error.code in set(Delay) and self._approved_again < APPROVED_AGAIN
-        return late and self._context.cell.own_simulator and self._records and not self._context.requests.halt
-
-    @property
-    def _records(self) -> bool:
-        return self._go.motion.stop_test is None
-
-    async def _approve_again(self, late: StationError) -> bool:
-        """Approve the remaining poses in a simulated cell; False: not possible."""
-        context, queue = self._context, self._queue
-        store, count = context.store, context.store.status.session.approved_again + 1
-        unmark_busy(context)
-        store.enter(StationState.CHECKING, late)
-        store.problem(late, "warning", store.status.session.current)
-        left = tuple(index for index in self._go.motion.poses if index in queue.open)
-        if not left:
-            return False
-        try:
-            go = await offered(context, Motion(Purpose.RESUME, queue, left), self._go.client_id)
-        except StationError as trouble:
-            store.problem(trouble)
-            return False
-        self._approved_again += 1
-        said = f"approved by this simulated cell itself, {self._approved_again} of at most {APPROVED_AGAIN}"
-        self._go = replace(go, approval=said)
-        store.update_session(approved_again=count)
-        store.event("approved-again", self._go.said, "warning", None, count=count)
-        return True
 
     async def _begin(self) -> bool:
         """Start control and open the recording. False when refused: the state is as before the approval."""
@@ -120,13 +72,11 @@ class Run:
             await self._mover.start_control()
             here = (await fresh(context.cell.arm)).joints_rad  # starting control takes a second or two
             require_start(here, self._go.start_joints_rad, "while control was started")
-            if self._records:
+            if self._go.motion.stop_test is None:
                 await self._open_recording()
         except SafetyStopError:
             raise
         except (StationError, RecordingError) as error:
-            if self._may_go_on(error):
-                raise
             if not context.requests.halt:
                 context.store.enter(resting, error)
                 context.store.problem(error, "error", said="not started: {}")

@@ -73,7 +73,6 @@ def simulated_cell(
         config_path=path,
         attachments={TRUTH: content} | (attachments or {}),
         ended=started.close,
-        own_simulator=True,
     )
 
 

@@ -20,7 +20,7 @@ from recordings.reader import open_recording
 from station.cell.config import ApprovalConfig, StationConfig
 from station.cell.pose_plan import Plan
 from station.cell.status import MotionPreview, StationState, StationStatus
-from station.operate.motion import prepared_motion, wait_until_idle, watched
+from station.operate.motion import prepared_motion, until_rest, wait_until_idle
 from station.plan.planner import make_plan
 from station.protocol.client import Client
 from station.protocol.verbs import Check, Doctor, LoadPlan, Prepare, Stop
@@ -95,7 +95,7 @@ async def yes(preview: MotionPreview) -> bool:
 async def captured(client: Client, plan: Plan) -> StationStatus:
     await client.call(LoadPlan(plan))
     assert await prepared_motion(client, Prepare(), yes)
-    return await watched(client, lambda status: None)
+    return await until_rest(client, lambda status: None)
 
 
 async def stopped_in_mid_move(client: Client, plan: Plan, arm: SimulatedController) -> StationStatus:

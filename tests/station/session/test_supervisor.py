@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from station.cell.status import StationState as S
+from station.devices.news import Delay
 from station.devices.rtde import RobotMode, SafetyMode
 from station.protocol.verbs import Purpose
 from station.session import supervisor
@@ -90,3 +91,13 @@ async def test_a_defect_in_the_stop_that_follows_a_defect_is_logged_too(
         await until(lambda: rig.session.supervisor.before_round.call_count > 1)
     logged = [record.exc_info[0] for record in caplog.records if record.exc_info]
     assert logged == [ZeroDivisionError, IndexError]
+
+
+async def test_news_of_a_resting_arm_that_came_late_are_told_with_what_made_them_late(rig: Rig) -> None:
+    rig.arm.late, rig.arm.gap_s = True, 0.8
+    watch = rig.session.supervisor
+    await until(lambda: watch._late_since_s)
+    watch._late_since_s -= 0.5
+    rig.arm.late = False
+    await until(lambda: rig.told(Delay.CONTROLLER))
+    assert rig.state is S.IDLE

@@ -119,6 +119,24 @@ def test_the_largest_gap_is_between_arrivals_and_knows_what_the_controller_left_
     assert largest_gap(states, 2.1, 2.2, 0.02) == (0.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("host", "clock_s", "blamed"),
+    [
+        ("192.0.2.10", 1.02, Delay.NETWORK),
+        ("192.0.2.10", 1.5, Delay.CONTROLLER),
+        ("127.0.0.1", 1.02, Delay.CONTROLLER),
+    ],
+)
+def test_a_link_tells_what_made_its_news_late(host: str, clock_s: float, blamed: Delay) -> None:
+    made: Any = UrLink(RobotConfig(model="UR10", host=host))
+    now_s = time.monotonic()
+    history = [arrived(now_s - 0.6, 1.0), arrived(now_s - 0.1, clock_s)]
+    made.reader = SimpleNamespace(history=history, rate_hz=50.0)
+    told = made.delay(0.0, now_s - 0.6)
+    assert told.code == blamed and told.values["late_ms"] == pytest.approx(500.0)
+    assert made.delay(0.0, now_s) is None
+
+
 def test_a_silence_is_the_watchdogs_business_only_before_the_program_ended() -> None:
     kicks_s = [0.0, 0.3, 0.35, 0.4, 0.9]
     assert longest_silence_s(kicks_s, 0.1, 0.42) == pytest.approx(0.05)

@@ -30,14 +30,16 @@ def emulated(lonely_network: None) -> Iterator[EmulatedCamera]:
 async def test_23_settings_changed_behind_our_back_are_refused(emulated: EmulatedCamera) -> None:
     async with opened() as camera:
         for change, address, before, value in (
-            (emulated.set_number, at.EXPOSURE, 1000, 4000),
-            (emulated.set_number, at.GAIN, 0, 10),
+            (emulated.set_number, at.EXPOSURE, 1000, 1030),
+            (emulated.set_number, at.EXPOSURE, 1000, 970),
+            (emulated.set_number, at.GAIN, 0, 0.3),
             (emulated.set_register, at.WIDTH, 1280, 640),
         ):
             change(address, value)
             with raises("settings-changed"):
                 await camera.capture()
             change(address, before)
+        emulated.set_number(at.EXPOSURE, 1010)  # as a camera rounds it
         await camera.capture()
 
 

@@ -15,7 +15,7 @@ from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice
 from station.devices.frames import DeviceClock
-from station.devices.genicam_settings import Applied, apply_settings, require_settings
+from station.devices.genicam_settings import apply_settings
 from tests.codes import raises
 
 REGION = (0, 0, 1280, 1024)
@@ -145,23 +145,11 @@ async def test_settings_are_read_after_the_exposure() -> None:
 
 
 class Settable:
-    """In place of `Aravis.Camera`: notes what is set and tells of what stands."""
+    """In place of `Aravis.Camera`: notes what is set."""
 
-    def __init__(
-        self, exposure_us: float, gain_db: float, region: tuple[int, int, int, int], unit: str | None = "dB"
-    ) -> None:
-        self._stands, self._unit = (exposure_us, gain_db, region), unit
-        self._node = SimpleNamespace(get_unit=lambda: unit)
+    def __init__(self, unit: str | None = "dB") -> None:
+        self._unit, self._node = unit, SimpleNamespace(get_unit=lambda: unit)
         self.set: dict[str, tuple[Any, ...]] = {}
-
-    def get_exposure_time(self) -> float:
-        return self._stands[0]
-
-    def get_gain(self) -> float:
-        return self._stands[1]
-
-    def get_region(self) -> Any:
-        return SimpleNamespace(**dict(zip(("x", "y", "width", "height"), self._stands[2], strict=True)))
 
     def get_device(self) -> Any:
         return SimpleNamespace(get_feature=lambda name: self._node)
@@ -193,19 +181,6 @@ class Settable:
         )
 
 
-@pytest.mark.parametrize(
-    ("exposure_us", "gain_db", "region"),
-    [(1030.0, 0.0, REGION), (970.0, 0.0, REGION), (1000.0, 0.3, REGION), (1000.0, 0.0, (8, 0, 1280, 1024))],
-)
-def test_another_exposure_gain_or_region_than_asked_for_is_refused(
-    exposure_us: float, gain_db: float, region: tuple[int, int, int, int]
-) -> None:
-    applied = Applied(REGION, 0.0, True)
-    assert require_settings(Settable(1010.0, 0.1, REGION), 1000.0, applied) == (1010.0, 0.1)
-    with raises("settings-changed"):
-        require_settings(Settable(exposure_us, gain_db, region), 1000.0, applied)
-
-
 LIBRARY = SimpleNamespace(
     RangeCheckPolicy=SimpleNamespace(ENABLE=1), AcquisitionMode=SimpleNamespace(CONTINUOUS="continuous")
 )
@@ -213,7 +188,7 @@ LIBRARY = SimpleNamespace(
 
 @pytest.mark.parametrize(("trigger", "line"), [("software", ("Software",)), ("hardware", ("Line2",))])
 def test_the_whole_sensor_is_set_with_the_right_trigger_and_automatics_off(trigger: Any, line: Any) -> None:
-    camera = Settable(1000.0, 0.0, REGION)
+    camera = Settable()
     config = CameraConfig(trigger=trigger, trigger_line="Line2")
     assert apply_settings(LIBRARY, camera, config).region == REGION
     assert camera.set["set_region"] == REGION and camera.set.get("set_trigger") == line
@@ -225,10 +200,10 @@ def test_the_whole_sensor_is_set_with_the_right_trigger_and_automatics_off(trigg
 
 
 def test_a_gain_that_is_not_in_db_is_the_smallest() -> None:
-    camera = Settable(1000.0, 0.0, REGION, unit="steps")
+    camera = Settable(unit="steps")
     with raises("gain-unit", low=36.0, high=512.0):
         apply_settings(LIBRARY, camera, CameraConfig(gain_db=6.0))
     applied = apply_settings(LIBRARY, camera, CameraConfig())
     assert applied.gain == 36.0 and not applied.gain_in_db
     with raises("no-gain"):
-        apply_settings(LIBRARY, Settable(1000.0, 0.0, REGION, unit=None), CameraConfig(gain_db=6.0))
+        apply_settings(LIBRARY, Settable(unit=None), CameraConfig(gain_db=6.0))

@@ -36,7 +36,7 @@ from tests.conftest import AT_REST_RAD_S, CONTROL_PATHS, rests_short_of_its_goal
 from tests.patience import PATIENCE_S, until
 from tests.station.quick_plan import quick_plan
 
-TRUTH = make_cell(seed=5)
+TRUTH = make_cell("paper-binned", seed=5)
 both_paths = pytest.mark.parametrize("rig", CONTROL_PATHS, indirect=True)
 PROGRAM = (sys.executable, "-m", "tests.system.cell_daemon")
 
@@ -211,16 +211,23 @@ def short_folder() -> Iterator[Path]:
 
 
 @pytest.fixture
+def time_scale() -> float:
+    """How many times faster the rig's arm moves than it says."""
+    return 1.0
+
+
+@pytest.fixture
 async def rig(
     controller: Callable[..., SimulatedController],
     short_folder: Path,
     tmp_path: Path,
+    time_scale: float,
     request: pytest.FixtureRequest,
 ) -> AsyncIterator[SystemRig]:
     """`@both_paths` runs a test with each way of driving the arm."""
     truth = short_folder / "truth.json"
     write_truth(TRUTH, truth)
-    running = await asyncio.to_thread(controller, "UR10", truth=truth)
+    running = await asyncio.to_thread(controller, "UR10", truth=truth, time_scale=time_scale)
     made = SystemRig(running, short_folder, tmp_path, getattr(request, "param", ""))
     yield made
     await asyncio.to_thread(made.end)

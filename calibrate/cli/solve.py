@@ -42,6 +42,7 @@ from calibrate.geometry import roll_pitch_yaw
 from calibrate.handeye.solution import camera_frames
 from calibrate.job import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 from calibrate.lens.intrinsics import LensModel
+from calibrate.report.page import report_page
 from calibrate.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits, bounded
 from calibrate.results import PeerResult
 
@@ -114,7 +115,6 @@ def solve(
         check_target(report, "report")
         if os.path.realpath(report) == os.path.realpath(target):
             raise UsageError("target-exists", path=target, by="both calibration and report")
-        from calibrate.report.page import report_page  # slow to load, and not always there
     with bounded(Limits(time_limit_s, memory_limit_mib)), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)

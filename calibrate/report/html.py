@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape as escape  # for the sections, too
 from pathlib import Path
 from typing import Literal
@@ -68,9 +68,33 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[
 
 
 def figure(drawn: str, caption: str, question: str = "") -> str:
-    """A plot or picture: the question that it answers above, the answer below."""
+    """Bars, a table or a picture: the question that it answers above, the answer below."""
     above = f"<h2>{escape(question)}</h2>" if question else ""
     return f"<figure>{above}{drawn}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def bars(values: Mapping[int, float], unit: str, limit: float | None = None) -> str:
+    """Draw a bar for each pose index, the largest in another colour, and the limit where it is near.
+
+    The scale's end is told in `unit`; every bar tells its value under the mouse.
+    """
+    first, last, largest = min(values), max(values), max(values, key=lambda index: values[index])
+    near = limit if limit is not None and values[largest] > 0.3 * limit else 0.0
+    top, poses = max(values[largest], near), last - first + 1
+    drawn = []
+    for index, value in values.items():
+        kind, told = "largest" * (index == largest), f"pose {index + 1}: {value:.2f} {unit}"
+        place = f'x="{index - first + 0.1:.1f}" y="{top - value:.4g}" width="0.8" height="{value:.4g}"'
+        drawn.append(f'<rect class="{kind}" {place}><title>{told}</title></rect>')
+    if near:
+        drawn.append(f'<line class="limit" x2="{poses}" y1="{top - near:.4g}" y2="{top - near:.4g}"/>')
+    inside = "\n".join(drawn)
+    return (
+        '<svg class="bars" viewBox="0 0 340 170">'
+        f'<text y="12">{top:.2f} {unit}</text><line x2="340" y1="18" y2="18"/>'
+        f'<svg y="18" height="130" viewBox="0 0 {poses} {top:.4g}" preserveAspectRatio="none">{inside}</svg>'
+        f'<text y="165">pose {first + 1}</text><text class="last" x="340" y="165">{last + 1}</text></svg>'
+    )
 
 
 def picture(jpeg: bytes, alt: str) -> str:

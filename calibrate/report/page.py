@@ -27,7 +27,7 @@ from calibrate.files.formatting import (
 from calibrate.geometry import Array, difference
 from calibrate.job import SolvedRecording
 from calibrate.projection import intrinsics_names, intrinsics_vector, project_pixels
-from calibrate.report import html, plots
+from calibrate.report import html
 from calibrate.views import board_in_camera
 from recordings import strict_yaml
 from recordings.images import viewable
@@ -220,14 +220,15 @@ def _plots(job: SolvedRecording) -> Iterator[str]:
         worst = max(px, key=lambda index: px[index])
         against = "." if limit is None else f" (limit {limit:g} px)."
         answer = f"Largest: pose {worst + 1}, {px[worst]:.2f} px{against}"
-        yield html.figure(plots.by_view(px, "px", limit), answer, "Does an image stand out?")
+        yield html.figure(html.bars(px, "px", limit), answer, "Does an image stand out?")
     if robot_mm := {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}:
         worst = max(robot_mm, key=lambda index: robot_mm[index])
         answer = f"Largest: pose {worst + 1}, {robot_mm[worst]:.2f} mm from where the image says."
-        yield html.figure(plots.by_view(robot_mm, "mm"), answer, "Was the arm where it said?")
+        yield html.figure(html.bars(robot_mm, "mm"), answer, "Was the arm where it said?")
     if shares := error_shares(job.calibration):
         answer = "Shares of the variance of the camera pose."
-        yield html.figure(plots.shares(shares), answer, "Where does the error come from?")
+        rows = [(name, f"{share:.0%}") for name, share in shares.items()]
+        yield html.figure(html.table(("", ""), rows, (1,)), answer, "Where does the error come from?")
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -103,7 +104,10 @@ def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Record
         (7, "unreadable-picture"),
     ]
     assert [rejected.index for rejected in job.calibration.views.rejected] == [3, 7]
-    assert loaded.without_board[0].reason in report_page(job)
+    page, largest_px = report_page(job), max(job.solution.residual_px.values())
+    assert loaded.without_board[0].reason in page
+    assert page.count(" px</title></rect>") == 6
+    assert re.search(rf'class="largest" \S+ y="0" \S+ height="{largest_px:.4g}"', page)
 
 
 def test_leaving_out_a_view_that_shows_no_board_is_fine(source: Recording, tmp_path: Path) -> None:

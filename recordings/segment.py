@@ -31,7 +31,6 @@ from recordings.schema.definitions import (
 )
 from recordings.schema.messages import (
     CaptureEvent,
-    ClockReading,
     Image,
     Matrix4,
     RobotState,
@@ -95,10 +94,6 @@ class RecordingSegment:
 
     def image_facts(self) -> Iterator[PictureFacts]:
         return self._decoded(Topic.PICTURE_FACTS, PictureFacts)
-
-    def clock_readings(self) -> Iterator[ClockReading]:
-        """Readings of the camera's clock, raw, in order."""
-        return self._decoded(Topic.CLOCK_READING, ClockReading)
 
     def image_sequences(self) -> list[int]:
         """Sequences of all images, in file order."""

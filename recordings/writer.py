@@ -27,7 +27,6 @@ from recordings.schema.definitions import CHANNEL_RECORDS, FORMATS, SESSION_RECO
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
-    ClockReading,
     Image,
     Matrix4,
     RobotState,
@@ -109,7 +108,7 @@ class RecordingWriter:
         if (width, height) != (camera.width, camera.height):
             raise wrong_size_error(f"Image {image.sequence}", (width, height), (camera.width, camera.height))
         told = msgspec.structs.asdict(image)
-        del told["pixels"], told["clock_readings"]
+        del told["pixels"]
         facts = PictureFacts(width=width, height=height, **told)
         time_ns = self._time_ns(image.stamps, image.sequence)
         try:
@@ -118,17 +117,10 @@ class RecordingWriter:
             raise RecordingError(
                 "bad-image", place=str(self.path), image=image.sequence, reason=str(error)
             ) from error
-        for reading in image.clock_readings:
-            self.clock_reading(reading)
         self._add(Topic.PICTURE_FACTS, encode(facts), time_ns, image.sequence)
         self._show(topic, message, time_ns, image.sequence)
         self._images[image.sequence] = time_ns
         self.flush()
-
-    def clock_reading(self, reading: ClockReading) -> None:
-        """Write a reading of the camera's clock; those that an image brings along come with the image."""
-        time_ns = self._time_ns(Stamps(host_wall_ns=reading.host_wall_ns))
-        self._add(Topic.CLOCK_READING, encode(reading), time_ns)
 
     def _image(self, image: Image, encoded: bytes | None, time_ns: int) -> tuple[Topic, Any]:
         if encoded is None:

@@ -172,7 +172,10 @@ class FrameTime(msgspec.Struct, frozen=True):
 
 
 class ClockReading(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One reading of a camera's clock, as it was: it showed `device_ns` between question and answer."""
+    """One reading of a camera's clock: it showed `device_ns` between question and answer.
+
+    Recorded by earlier versions.
+    """
 
     asked_monotonic_ns: int
     answered_monotonic_ns: int
@@ -219,8 +222,6 @@ class Image(msgspec.Struct, frozen=True, eq=False):
     trigger_count: int | None = None
     time: FrameTime | None = None
     """Middle of the exposure; every camera gives it. None: recorded before there was such a thing."""
-    clock_readings: tuple[ClockReading, ...] = ()
-    """Readings of the camera's clock since the frame before; empty when read from a recording."""
 
 
 class Stillness(msgspec.Struct, frozen=True, omit_defaults=True):

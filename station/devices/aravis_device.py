@@ -156,10 +156,10 @@ class GenicamDevice:
                 device_ns = self._to_ns(self._camera.get_integer(value))
                 while device_ns == self._latched_ns and time.monotonic_ns() < asked_ns + _LATCH_WAIT_S * 1e9:
                     device_ns = self._to_ns(self._camera.get_integer(value))
-                answered_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+                answered_ns = time.monotonic_ns()
             if device_ns != self._latched_ns:
                 self._latched_ns = device_ns
-                clock.add(ClockReading(asked_ns, answered_ns, device_ns, wall_ns))
+                clock.add(ClockReading(asked_ns, answered_ns, device_ns))
             return
 
     def _to_ns(self, ticks: int) -> int:

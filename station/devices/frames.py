@@ -12,7 +12,6 @@ from station.cell.clock_fit import ClockFit
 from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
 
-READINGS_KEPT = 200
 UNKNOWN_READOUT_S = 0.05
 """Longest time from the end of an exposure to its first packet, where nothing else limits it."""
 LARGEST_IDS = tuple((1 << bits) - 1 for bits in (8, 16, 32, 64))
@@ -102,7 +101,6 @@ class DeviceClock:
         self.restart()
 
     def restart(self) -> None:
-        self._fresh: list[ClockReading] = []
         self.fit: ClockFit | None = None
         """By the reading that tells most about now; None before the first one."""
 
@@ -111,7 +109,6 @@ class DeviceClock:
 
         One that does not agree with it begins anew: the clock was set or started again.
         """
-        self._fresh = [*self._fresh[1 - READINGS_KEPT :], reading]
         half_ns = (reading.answered_monotonic_ns - reading.asked_monotonic_ns) / 2
         # Difference of integers first: stamps of 1.7e18 ns have no room in a float.
         offset_ns = float(reading.asked_monotonic_ns - reading.device_ns) + half_ns
@@ -122,11 +119,6 @@ class DeviceClock:
             if still_s < new.bound_s and apart_s <= still_s + new.bound_s:
                 return
         self.fit = new
-
-    def take_fresh(self) -> tuple[ClockReading, ...]:
-        """Readings that were not taken before, oldest first: each is recorded once."""
-        fresh, self._fresh = tuple(self._fresh), []
-        return fresh
 
 
 def by_clock(start_device_ns: int, exposure_us: float, fit: ClockFit, source: TimeSource) -> FrameTime:
@@ -190,7 +182,7 @@ class FrameClock:
         return FrameTiming("latched", fit.bound_s, fit)
 
     def timed(self, image: Image, *, asked_ns: int | None = None, pulse: TriggerPulse | None = None) -> Image:
-        """Return the image with its time and the clock readings since the previous image.
+        """Return the image with its time.
 
         `asked_ns`: host time just before its trigger; None: not triggered. `pulse`: of the trigger box.
         """
@@ -205,7 +197,7 @@ class FrameClock:
                 self._newest = told
             else:
                 self._impossible += 1
-        return msgspec.structs.replace(image, time=self._newest, clock_readings=self.readings.take_fresh())
+        return msgspec.structs.replace(image, time=self._newest)
 
 
 def _possible(told: FrameTime, image: Image, asked_ns: int | None) -> bool:

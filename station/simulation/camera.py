@@ -135,7 +135,7 @@ class RenderedCamera:
     async def _read_clock(self) -> None:
         asked_ns = time.monotonic_ns()
         device_ns = await self._call("clock")
-        self._clock.readings.add(ClockReading(asked_ns, time.monotonic_ns(), device_ns, time.time_ns()))
+        self._clock.readings.add(ClockReading(asked_ns, time.monotonic_ns(), device_ns))
 
     async def _call(self, *request: object, timeout_s: float = _ANSWER_S) -> Any:
         try:

@@ -15,7 +15,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from recordings.images import encode_png
 from recordings.info import recording_info
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, CaptureEvent, ClockReading, FrameTime, Image, Stamps
+from recordings.schema.messages import CameraModel, CaptureEvent, FrameTime, Image, Stamps
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import (
     HEIGHT,
@@ -50,15 +50,12 @@ def test_everything_comes_back_as_it_was(small: Path) -> None:
     assert recording.sha256 == hashlib.sha256(small.read_bytes()).hexdigest()
 
 
-def test_times_of_frames_and_raw_readings_of_the_cameras_clock_come_back(tmp_path: Path) -> None:
-    readings = (ClockReading(1, 3, 2, START_NS, synchronized=True), ClockReading(4, 6, 50))
+def test_times_of_frames_come_back(tmp_path: Path) -> None:
     times = [FrameTime(7, 0.001, "chunk"), None]
     writer = RecordingWriter(tmp_path / "small.mcap", make_info())
     for sequence, told in enumerate(times):
-        picture = msgspec.structs.replace(make_picture(sequence), time=told, frame_id=None)
-        writer.image(msgspec.structs.replace(picture, clock_readings=() if sequence else readings))
+        writer.image(msgspec.structs.replace(make_picture(sequence), time=told, frame_id=None))
     (segment,) = open_recording(writer.finish()).segments
-    assert tuple(segment.clock_readings()) == readings
     assert [segment.image(n).time for n in (0, 1)] == times == [f.time for f in segment.image_facts()]
     assert segment.image(0).frame_id is None
 

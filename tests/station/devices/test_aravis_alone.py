@@ -55,7 +55,7 @@ def shown_ns(device: Any, camera: Clockwork) -> list[int]:
     device._camera = camera
     clock = DeviceClock()
     device.latch(clock)
-    return [reading.device_ns for reading in clock.take_fresh()]
+    return [] if clock.fit is None else [round(1e9 * clock.fit.reference_s)]
 
 
 def test_a_clock_that_shows_no_other_time_says_nothing(device: Any) -> None:

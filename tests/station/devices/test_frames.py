@@ -75,7 +75,6 @@ def test_a_frame_is_placed_by_the_best_source_that_it_bears_out() -> None:
     assert clock.timing.source == "latched"
     good = clock.timed(frame(1000, 501_040), asked_ns=500_999 * MS)
     assert good.time == FrameTime(501_010 * MS, pytest.approx(0.00011), "latched")
-    assert len(good.clock_readings) == 1 and not clock.timed(good).clock_readings, "each is recorded once"
     for device_ms in (998, 1025):  # before its trigger; still exposing when its first packet came
         wrong = clock.timed(frame(device_ms, 501_040), asked_ns=500_999 * MS)
         assert wrong.time == by_arrival(501_040 * MS, 20_000.0, 500_999 * MS)

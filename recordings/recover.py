@@ -46,6 +46,10 @@ from recordings.schema.topics import Topic, schema_bytes, schema_name
 from recordings.segment import RecordingSegment
 
 DAMAGED_SUFFIX = ".damaged"
+_LEAST_OF_A_POSE_BYTES = sum(
+    len(schema_bytes(topic)) for topic in (Topic.PICTURE_FACTS, Topic.RAW_IMAGE, Topic.VIEW)
+)
+"""A smaller file held no pose: these stand before the first one."""
 
 
 @dataclass(frozen=True)
@@ -127,13 +131,15 @@ def _recover_session(folder: Path) -> list[Recovery]:
 
 
 def _recover_segment(source: Path) -> Recovery:
-    """A segment that was begun but holds nothing is set aside, the session goes on without it."""
+    """A segment of which nothing can be saved is set aside, as empty where it never held a pose."""
     try:
         return _recover_file(source, None)
     except _NothingToSaveError as error:
-        aside = _free_name(source.with_name(source.name + EMPTY_SUFFIX))
+        size_bytes = source.stat().st_size
+        suffix = EMPTY_SUFFIX if size_bytes < _LEAST_OF_A_POSE_BYTES else DAMAGED_SUFFIX
+        aside = _free_name(source.with_name(source.name + suffix))
         rename_new(source, aside)
-        return Recovery(source, aside, lost_bytes=aside.stat().st_size, losses=(str(error),))
+        return Recovery(source, aside, lost_bytes=size_bytes, losses=(str(error),))
 
 
 def _recover_file(source: Path, output: Path | None) -> Recovery:
@@ -240,15 +246,24 @@ def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment
 
 
 def _declare_by_records(contents: Contents) -> None:
-    """Declare the channels of this station whose declaration is lost with its chunk."""
+    """Declare the channels of this station whose declaration is lost with its chunk.
+
+    None where a declared channel contradicts the records: another program numbered the channels anew.
+    """
+    told: dict[int, str] = {}
     for name, record in contents.metadata.items():
-        number = name.removeprefix(CHANNEL_RECORDS)
-        known = number != name and number.isdecimal() and record.get("topic") in set(Topic)
-        if known and int(number) not in contents.channels:
-            topic = Topic(record["topic"])
-            schema = Schema(-int(number), schema_bytes(topic), "protobuf", schema_name(topic))
-            contents.schemas[schema.id] = schema
-            contents.channels[int(number)] = Channel(int(number), topic.value, "protobuf", {}, schema.id)
+        digits = name.removeprefix(CHANNEL_RECORDS)
+        if digits != name and digits.isdecimal() and record.get("topic") in set(Topic):
+            told[int(digits)] = record["topic"]
+    for channel in contents.channels.values():
+        mentioned = channel.id in told or channel.topic in told.values()
+        if mentioned and told.get(channel.id) != channel.topic:
+            return
+    for number in told.keys() - contents.channels.keys():
+        topic = Topic(told[number])
+        schema = Schema(-number, schema_bytes(topic), "protobuf", schema_name(topic))
+        contents.schemas[schema.id] = schema
+        contents.channels[number] = Channel(number, topic.value, "protobuf", {}, schema.id)
 
 
 def _orphans(found: Salvage) -> set[int]:

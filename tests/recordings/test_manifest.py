@@ -69,8 +69,12 @@ def test_a_part_that_held_nothing_is_not_missing(session: Path) -> None:
     assert [part.info.part for part in open_recording(session).segments] == [1, 3]
 
 
-def test_a_sealed_part_of_which_nothing_is_left_is_missing(session: Path) -> None:
-    (session / "session-3.mcap").write_bytes(b"\x00" * 500)
+@pytest.mark.parametrize(("name", "left_as"), [("session-3.mcap", ""), ("session-2.mcap", ".part")])
+def test_a_part_that_held_poses_and_of_which_nothing_is_left_is_missing(
+    session: Path, name: str, left_as: str
+) -> None:
+    path = (session / name).rename(session / f"{name}{left_as}")
+    path.write_bytes(bytes(path.stat().st_size))
     assert [result.missing for result in recover_recording(session)] == [False, False, False, True]
     assert len(open_recording(session).losses) == 1
 

@@ -95,7 +95,7 @@ def import_command(
     with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
         if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
-        elif source.exists() and not any(path.suffix in BAGS for path in [source, *source.glob("*")]):
+        elif source.exists() and not any(path.name.endswith(BAGS) for path in [source, *source.glob("*")]):
             held = look(source, poses)
             told = read_dataset(dataset)[0] if dataset else _told(held.root, output)
             given = Given(convention, mount, None if board is None else typed_board(board))

@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from recordings.errors import ImportSourceError
-from recordings.files import open_file
+from recordings.files import PART_SUFFIX, open_file
 from recordings.importers.messages import ImageMessage, Kind, Progress, Value, decoded, kind_of, ros_types
 from recordings.mcap.contents import Contents, MessageIndex
 from recordings.mcap.scan import scan_file
 from recordings.mcap.source import Source
 from recordings.schema.definitions import SESSION_RECORDS
 
-BAGS = (".mcap", ".bag", ".db3", ".zstd")
-"""Suffixes of files of bags."""
+UNFINISHED = ".mcap" + PART_SUFFIX
+BAGS = (".mcap", UNFINISHED, ".bag", ".db3", ".zstd")
+"""Ends of the names of files of bags, and of a recording that was not finished."""
 _RESCUE = "mcap recover FILE, with the mcap command line tool"
 _SHOWN_EVERY = 64
 """Messages between two reports of progress."""
@@ -83,8 +84,6 @@ class Bag(ABC):
 
 def open_bag(path: Path, progress: Progress = lambda done, total, text: None) -> Bag:
     """A bag's folder, or one file; MCAP is proven first. Raises ImportSourceError or RecordingError."""
-    if not path.exists():
-        raise ImportSourceError("no-file", path=path)
     if path.is_dir():
         mcap, ros = sorted(path.glob("*.mcap")), sorted(path.glob("*.bag"))
         if not ros and any(file.suffix in (".db3", ".zstd") for file in path.iterdir()):

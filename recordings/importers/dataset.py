@@ -134,8 +134,8 @@ def _camera_problem(camera: CameraModel | None) -> tuple[str, str] | None:
     K = np.array(camera.matrix)
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         return "matrix", "it must be 3×3 with positive focal lengths"
-    if K[2].tolist() != [0, 0, 1]:
-        return "matrix", "its last row must be [0, 0, 1]"
+    if K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
+        return "matrix", "its lower rows must be [0, fy, cy] and [0, 0, 1]"
     return None
 
 

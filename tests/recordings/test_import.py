@@ -170,6 +170,7 @@ def dataset(text: str, code: str = "dataset", **values: object) -> Bad:
 HEADER = "image,x,y,z,qx,qy,qz,qw\n"
 HALF = "0.7071067811865476,0.7071067811865476"
 SINGULAR = "height: 24, matrix: [[0,0,0],[0,0,0],[0,0,1]]"
+SHEARED = "height: 24, matrix: [[900,0,16],[1,900,12],[0,0,1]]"
 BAD: dict[str, Bad] = {
     "no dataset": (lambda f: (f / "dataset.yaml").unlink(), "missing-file", {}),
     "no poses": (lambda f: (f / "poses.csv").unlink(), "missing-file", {}),
@@ -218,6 +219,7 @@ BAD: dict[str, Bad] = {
     "square in mm": key("0.025", "25", "board.square_m"),
     "no number": key("0.025", "25 mm", "board.square_m"),
     "singular camera": key("height: 24", SINGULAR, "camera.matrix"),
+    "sheared camera": key("height: 24", SHEARED, "camera.matrix"),
     "distortion alone": key("height: 24", "height: 24, distortion: [0.1]", "camera.matrix"),
     "charuco without markers": key("chessboard", "charuco", "board.marker_m"),
     "not yaml": dataset("mount: : :", line=1),
@@ -239,6 +241,13 @@ def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -
     result = call(main, "import", folder, "-o", output, "--json")
     assert result.returncode == 0
     assert json.loads(result.stdout) == {"recording": str(output), "views": 3, "bytes": output.stat().st_size}
+
+
+def test_a_source_that_is_unfinished_or_not_there_is_named_not_its_folder(small: Path) -> None:
+    part = small.rename(small.with_name("a.mcap.part"))
+    for source, code in ((part, "unfinished-recording"), (small, "no-file")):
+        told = call(main, "import", source, "-o", small.with_name("out.mcap"), "--json")
+        assert json.loads(told.stdout)["error"]["code"] == code
 
 
 DOCUMENT = Path(__file__).parent.parent.parent / "docs/integrator/import.md"

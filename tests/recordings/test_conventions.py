@@ -55,6 +55,8 @@ def test_numbers_say_what_they_can() -> None:
     forms = {how.name for how, _ in possible(np.array([[400.0, 0, 300, half, 0, 0, half]] * 3))}
     assert forms == {"xyzw-mm", "wxyz-mm"}
     assert possible(np.array([[0.4, 0, 0.3, half, half, half, half]] * 3)) == []
-    assert possible(np.concatenate([2 * np.eye(4).ravel()])[None]) == []
+    for scale, found in ((1, ["matrix"]), (2, []), ([1, 1, -1], [])):  # larger, mirrored
+        rows = np.hstack([np.diag(np.ones(3) * scale), np.full((3, 1), 0.4)])
+        assert [how.name for how, _ in possible(rows.reshape(1, 12))] == found
     assert all(how.degrees for how, _ in possible(np.array([[400.0, 0, 300, 90, 0, 20]] * 3)))
     assert not any(how.degrees for how, _ in possible(np.array([[0.4, 0, 0.3, 1, 0, 2]] * 3)))

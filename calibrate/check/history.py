@@ -15,6 +15,8 @@ from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec
 
 FILE = "checks.jsonl"
+BY_CHANCE = 0.001
+"""p from which a failed check is weak evidence, to be repeated before anything is done."""
 
 
 class Trend(msgspec.Struct, frozen=True):
@@ -42,6 +44,8 @@ class CheckEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     """δt (m), δφ (rad)"""
     statistic: float
     threshold: float
+    p_value: float = 0.0
+    """0 in entries of older versions, which did not keep it."""
     trend: Trend | None = None
     """Over the checks up to this one; None where chance explains them."""
     right: tuple[float, ...] = ()

@@ -32,6 +32,7 @@ def entry_of(
         tuple(check.shift.tolist()),
         check.statistic,
         check.threshold,
+        check.p_value,
         right=tuple(evidence.right.tolist()),
         information_lower=tuple(evidence.N[np.tril_indices(len(evidence.N))].tolist()),
         board=board,

@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from calibrate.check.drift import FEWEST_FOR_DRIFT_CHECK, POWER, DriftCheck, check_drift, known_cell
-from calibrate.check.history import Trend, append_check, read_checks
+from calibrate.check.history import BY_CHANCE, Trend, append_check, read_checks
 from calibrate.check.production import MOST_PICTURES, check_production
 from calibrate.check.same_cell import OtherCellError, require_same_cell
 from calibrate.check.trend import entry_of, find_trend
@@ -37,7 +37,6 @@ from recordings.schema.messages import BoardSpec, SessionInfo
 DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
 MOST_DISAGREEMENT = 3.0
-_BY_CHANCE = 0.001
 """p below which a failure is told as certain: above it, repeating the check is advised."""
 
 
@@ -214,7 +213,7 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
         sure = "Check the camera's bracket, and calibrate again."
         text = (
             f"FAIL: camera shift {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° "
-            f"(p = {result.p_value:.1e}). {sure if result.p_value < _BY_CHANCE else weak}"
+            f"(p = {result.p_value:.1e}). {sure if result.p_value < BY_CHANCE else weak}"
         )
     else:
         verdict = "PASS" if result.power >= POWER else "PASS, low sensitivity"

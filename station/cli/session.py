@@ -24,7 +24,7 @@ from station.cell.socket_folder import default_socket
 from station.cell.status import CHECK_VIEWS, MotionPreview, StationState, StationStatus
 from station.cli.console import AsJson, Headless, Socket, err, out, print_json
 from station.devices.news import Delay
-from station.operate.drift_check import check_arguments, judged, start_drift_check
+from station.operate.drift_check import check_arguments, start_drift_check
 from station.operate.motion import (
     HASH_DIGITS,
     Watcher,
@@ -34,7 +34,6 @@ from station.operate.motion import (
     until_rest,
     wait_until_idle,
 )
-from station.operate.next_step import after_capture
 from station.plan.files import load_plan
 from station.protocol.client import Client
 from station.protocol.verbs import Acknowledge, Finish, LoadPlan, Prepare, Purpose, Stop
@@ -273,7 +272,7 @@ def drift_check_command(
     Exit codes: 0 PASS, 4 FAIL, 1 no recording or nothing installed, 2 usage.
     """
 
-    async def captured() -> tuple[StationStatus, str]:
+    async def captured() -> StationStatus:
         async with attended(socket, headless, approve, quiet=headless) as shell:
             standing = await shell.status()
             if standing.robot.by_hand:  # a person who moves it needs the picture
@@ -281,15 +280,13 @@ def drift_check_command(
                 raise RefusedError("moved-by-hand", robot=identity.model if identity else "The arm")
             kept = None if plan is None else load_plan(plan)
             started = await start_drift_check(shell.client, standing, shell.approves, poses, kept)
-            return await shell.watch(started, standing), shell.client.camera
+            return await shell.watch(started, standing)
 
-    outcome, camera = asyncio.run(captured())
+    outcome = asyncio.run(captured())
     if not outcome.session.recording:
         _finish(outcome, False)
     what = check_arguments(outcome.session.recording, outcome.session.folder)
     done = subprocess.run([sys.executable, "-m", "calibrate.cli", *what])
-    if (end := judged(outcome.session.folder, camera)) is not None:
-        out.print(str(end))
     raise typer.Exit(done.returncode)
 
 
@@ -328,9 +325,13 @@ def _finish(outcome: StationStatus, as_json: bool) -> None:
         print_json(SessionJson(outcome.state, poses, session.recording))
     elif session.recording:
         out.print(f"{session.captured} of {len(session.poses)} poses, finished: {session.recording}")
-        out.print(str(after_capture(session)))
-        if not session.check:
-            out.print(f"Next: calibrate solve {shlex.quote(session.recording)}", soft_wrap=True)
+        for pose in session.poses:
+            if pose.state == "failed":
+                out.print(f"Not captured: pose {pose.index + 1}. {pose.reason}")
+        next_step = ("solve", session.recording)
+        if session.check:
+            next_step = check_arguments(session.recording, session.folder)
+        out.print(f"Next: calibrate {shlex.join(next_step)}")
     else:
         err.print(Text.assemble((outcome.state.value, "bold"), f": {outcome.reason}"))
     raise typer.Exit(1 if not session.recording else 3 if session.captured < len(session.poses) else 0)

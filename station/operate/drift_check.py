@@ -6,12 +6,10 @@ from pathlib import Path
 
 import msgspec
 
-from calibrate.check.history import read_checks
 from calibrate.files.install import installed_calibration
 from station.cell.pose_plan import Plan
 from station.cell.status import CHECK_VIEWS, SessionStatus, StationState, StationStatus
 from station.operate.motion import PREPARE_S, Approve, prepared_motion
-from station.operate.next_step import NextStep, after_drift_check
 from station.protocol.client import Client
 from station.protocol.verbs import Freedrive, GetPlan, LoadPlan, MakePlan, Prepare, Purpose
 
@@ -74,16 +72,6 @@ async def recorded(link: Client, before: str) -> SessionStatus | None:
         if ours and session.recording and status.state is StationState.IDLE:
             return session
     return None
-
-
-def judged(folder: str, camera: str) -> NextStep | None:
-    """Judge this session's drift check and say what to do after it; None: it was not judged."""
-    path = Path(folder).resolve()
-    history = read_checks(path.parents[1], camera)
-    entry = next((entry for entry in reversed(history) if entry.recording == path.name), None)
-    if entry is None:
-        return None
-    return after_drift_check(entry)
 
 
 def check_arguments(recording: str, folder: str) -> tuple[str, ...]:

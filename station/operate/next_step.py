@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from calibrate.check.history import CheckEntry
+from calibrate.check.history import BY_CHANCE, CheckEntry
 from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch, agrees, touch_sigmas
-from station.cell.status import SessionStatus
 
 
 class StepKind(StrEnum):
     """Next step after a procedure."""
 
-    SOLVE = "solve"
     INSTALL = "install"
     KEEP = "keep"
     RETAKE = "retake"
@@ -31,19 +29,6 @@ class NextStep:
 
     def __str__(self) -> str:
         return f"{self.kind.value.capitalize()}: {self.text}"
-
-
-def after_capture(session: SessionStatus) -> NextStep:
-    """Recommend a step after a finished or paused session."""
-    failed = [str(pose.index + 1) for pose in session.poses if pose.state == "failed"]
-    if failed:
-        causes = {pose.reason for pose in session.poses if pose.state == "failed" and pose.reason}
-        why = f" ({'; '.join(sorted(causes)[:2])})" if causes else ""
-        which = f"pose {failed[0]} was" if len(failed) == 1 else f"poses {', '.join(failed)} were"
-        return NextStep(StepKind.RETAKE, f"{which} not captured{why}")
-    if session.check:
-        return NextStep(StepKind.SOLVE, "the drift check judges the installed calibration by this recording")
-    return NextStep(StepKind.SOLVE, "the recording is finished")
 
 
 def after_solve(calibration: Calibration, objections: Sequence[str] = ()) -> NextStep:
@@ -81,6 +66,8 @@ def after_drift_check(entry: CheckEntry) -> NextStep:
         return NextStep(StepKind.LOOK_FOR, entry.trend.text)
     if entry.passed:
         return NextStep(StepKind.KEEP, "the installed calibration holds")
+    if entry.p_value >= BY_CHANCE:
+        return NextStep(StepKind.RETAKE, f"the drift check. Its evidence is weak (p = {entry.p_value:.3f})")
     return NextStep(
         StepKind.LOOK_FOR,
         "a loose camera or board mount. Tighten it, then capture and install a new calibration",

@@ -19,7 +19,7 @@ import typer
 
 from recordings.errors import CodedError, ErrorReport
 from station.cell.errors import StationError
-from station.cell.status import MotionPreview
+from station.cell.status import MotionPreview, PoseStatus, SessionStatus, StationStatus
 from station.cli import daemon, main, session
 from station.cli.app import STATION
 from station.cli.daemon import ensure_daemon, own_daemon, tell_what_goes_on
@@ -108,6 +108,17 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
         assert (status["state"], status["cause"]) == ("stopped", "stop")
         assert shell.ask("acknowledge")[0] == 0
         shell.ask("finish")
+
+
+def test_a_session_with_loss_names_what_is_missing_and_ends_with_3(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    missed = PoseStatus(1, "p02", state="failed", reason="the board is not seen")
+    poses = (PoseStatus(0, "p01", state="done"), missed)
+    with pytest.raises(typer.Exit) as end:
+        session._finish(StationStatus(session=SessionStatus(poses=poses, captured=1, recording="/r")), False)
+    said = capsys.readouterr().out
+    assert end.value.exit_code == 3 and f"pose 2. {missed.reason}" in said and "calibrate solve /r" in said
 
 
 async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:

@@ -118,6 +118,15 @@ class CameraConfig(Section, frozen=True):
     """`model` is used for planning only; intrinsics are estimated from the session's images."""
 
 
+class CameraChoice(msgspec.Struct, frozen=True):
+    """A camera that answered when cameras were looked for."""
+
+    driver: Literal["aravis", "webcam"]
+    device: str
+    """Serial number, address or name, as `CameraConfig.device` takes it."""
+    name: str
+
+
 class TriggerConfig(Section, frozen=True):
     GONE: ClassVar = frozenset({"mode", "light_level"})
 

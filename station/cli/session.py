@@ -328,9 +328,8 @@ def _finish(outcome: StationStatus, as_json: bool) -> None:
         for pose in session.poses:
             if pose.state == "failed":
                 out.print(f"Not captured: pose {pose.index + 1}. {pose.reason}")
-        next_step = ("solve", session.recording)
-        if session.check:
-            next_step = check_arguments(session.recording, session.folder)
+        judge = check_arguments(session.recording, session.folder)
+        next_step = judge if session.check else ("solve", session.recording)
         out.print(f"Next: calibrate {shlex.join(next_step)}")
     else:
         err.print(Text.assemble((outcome.state.value, "bold"), f": {outcome.reason}"))

@@ -14,29 +14,32 @@ from recordings.images import viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity
 from station.analysis.hand_guide import HandGuide
 from station.analysis.worker import BoardDetection, CapturedView, sight
-from station.cell.config import StillnessConfig
+from station.cell.config import CameraChoice, StillnessConfig
 from station.cell.errors import StationError
 from station.cell.layout import flange_pose
 from station.cell.status import GuidanceStatus
 from station.cell.stillness import StillnessMonitor
+from station.devices.base import Camera
+from station.devices.guided import GuidedArm, RealHardware
 from station.operate import draft as drafts
-from station.operate.draft import POSTED, ArmReader, CameraChoice, CameraReader, CellStep, Draft, Hardware
+from station.operate.draft import POSTED, CellStep, Draft
 
 GREY_WANTED = 110.0
 """Mean grey of a well exposed image of paper and table, of 255."""
 EXPOSURE_US = (50.0, 200_000.0)
+EXPOSURE_TRIES = 4
 _LOOKED_FOR = (CellStep.BOARD, CellStep.VIEWS)
 
 
 class CellSetup:
     """State of the setup. Only reads from the arm, except `stop`, which ends its program."""
 
-    def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
+    def __init__(self, hardware: RealHardware, root: Path, output: Path) -> None:
         """`root` keeps the draft; `output` is the configuration to write."""
         self._hardware, self.root, self.output = hardware, root, output
         self.draft: Draft = drafts.load_draft(root)
-        self.arm: ArmReader | None = None
-        self.camera: CameraReader | None = None
+        self.arm: GuidedArm | None = None
+        self.camera: Camera | None = None
         self.cameras: tuple[CameraChoice, ...] = ()
         self.seen: BoardDetection | None = None
         """The board in the newest image; None: it was not looked for."""
@@ -73,7 +76,8 @@ class CellSetup:
         if arm is not None:
             robot = arm.identity
             arm.subscribe(self._stillness.add)
-        same = self.draft.robot is not None and self.draft.robot.serial == robot.serial
+        before = self.draft.robot
+        same = before is not None and (before.serial or self.draft.host) == (robot.serial or host)
         self._found(same, host=host, robot=robot)
 
     async def look_for_cameras(self) -> bool:
@@ -88,20 +92,33 @@ class CellSetup:
         """Show what this camera sees from now on, exposed well; False: it was shown already. CameraError."""
         if self.draft.camera == chosen and self.camera is not None:
             return False
-        camera = await self._hardware.camera(chosen)
-        try:
-            await camera.expose(self.draft.exposure_us)
-            image = await _exposed(camera)
-        except BaseException:  # else it is in use when it is tried again
-            await camera.close()
-            raise
+        camera, exposure_us, image = await self._opened(chosen)
         if self.camera is not None:
             await self.camera.close()
         self.camera = camera
         height, width = image.pixels.shape[:2]
-        same, exposure_us = self.draft.camera == chosen, camera.exposure_us
-        self._found(same, camera=chosen, width=width, height=height, exposure_us=exposure_us)
+        self._found(
+            self.draft.camera == chosen, camera=chosen, width=width, height=height, exposure_us=exposure_us
+        )
         return True
+
+    async def _opened(self, chosen: CameraChoice) -> tuple[Camera, float, Image]:
+        """Open a camera with an exposure (µs) that suits what it sees, found in a few tries. CameraError."""
+        exposure_us = self.draft.exposure_us
+        for tries in range(EXPOSURE_TRIES):
+            camera = await self._hardware.camera(chosen, exposure_us)
+            try:
+                image = await camera.glimpse()
+            except BaseException:  # else it is in use when it is tried again
+                await camera.close()
+                raise
+            mean = float(np.mean(image.pixels)) / (1 if image.pixels.dtype == np.uint8 else 257)
+            wanted_us = round(float(np.clip(exposure_us * GREY_WANTED / max(mean, 2.0), *EXPOSURE_US)), 1)
+            if 0.6 < mean / GREY_WANTED < 1.5 or wanted_us == exposure_us or tries == EXPOSURE_TRIES - 1:
+                break
+            await camera.close()
+            exposure_us = wanted_us
+        return camera, exposure_us, image
 
     def _found(self, same: bool, **values: object) -> None:
         """Keep what a device tells; views of another device count no more."""
@@ -162,15 +179,3 @@ class CellSetup:
         for device in (self.camera, self.arm):
             if device is not None:
                 await device.close()
-
-
-async def _exposed(camera: CameraReader) -> Image:
-    """Take an image, adjusting the exposure to `GREY_WANTED` in a few tries. Raises CameraError."""
-    for _ in range(4):
-        image = await camera.glimpse()
-        mean = float(np.mean(image.pixels)) / (1 if image.pixels.dtype == np.uint8 else 257)
-        wanted_us = float(np.clip(camera.exposure_us * GREY_WANTED / max(mean, 2.0), *EXPOSURE_US))
-        if 0.6 < mean / GREY_WANTED < 1.5 or wanted_us == camera.exposure_us:
-            return image
-        await camera.expose(wanted_us)
-    return image

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 import numpy as np
 
 from recordings.files import ASKED_FOR, read_file, write_atomically
-from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity, RobotState
+from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotIdentity
 from station.analysis.found_cell import FoundCell, find_cell
 from station.analysis.worker import CapturedView
+from station.cell.config import CameraChoice
 
 FEWEST_GUIDED = 4
 """Fewest views that are asked for."""
@@ -37,68 +36,6 @@ class CellStep(StrEnum):
 
 
 STEPS = tuple(CellStep)
-
-
-class CameraChoice(msgspec.Struct, frozen=True):
-    """A camera that answered."""
-
-    driver: str
-    device: str
-    """Serial number, address or name, as `camera.device` takes it."""
-    name: str
-
-
-class ArmReader(Protocol):
-    """The read-only half of an arm."""
-
-    @property
-    def identity(self) -> RobotIdentity: ...
-
-    @property
-    def remote(self) -> bool | None:
-        """Remote control is on; None where there is no such switch."""
-
-    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
-        """Call back with every state in order: the callback must be quick."""
-
-    def latest(self) -> RobotState:
-        """Newest state. Raises RobotError."""
-
-    def trouble(self) -> str:
-        """Why the arm cannot be guided now, and what to do on the pendant; empty: nothing."""
-
-    async def stop(self) -> None:
-        """STOP, by the dashboard: it ends whatever program runs on the controller. RobotError if refused."""
-
-    async def close(self) -> None: ...
-
-
-class CameraReader(Protocol):
-    """A camera that shows what it sees."""
-
-    async def glimpse(self) -> Image:
-        """An image exposed after this call. Raises CameraError."""
-
-    async def expose(self, exposure_us: float) -> None:
-        """Set another exposure time."""
-
-    @property
-    def exposure_us(self) -> float: ...
-
-    async def close(self) -> None: ...
-
-
-class Hardware(Protocol):
-    """Access to devices, implemented by the command line, so that this package needs no drivers."""
-
-    async def arm(self, host: str) -> ArmReader:
-        """Connect for reading only. Raises RobotError that names the pendant's menu items."""
-
-    async def cameras(self) -> tuple[CameraChoice, ...]:
-        """Cameras that answer now. Raises CameraError."""
-
-    async def camera(self, found: CameraChoice) -> CameraReader:
-        """Open it. Raises CameraError."""
 
 
 class Draft(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -153,7 +153,7 @@ def made_config(draft: Draft) -> StationConfig:
         step = next_step(draft)
         raise RefusedError("step-missing", number=STEPS.index(step) + 1, step=step.value)
     opened = CameraConfig(
-        driver=camera.driver,  # type: ignore[arg-type]  # as it was found
+        driver=camera.driver,
         device=camera.device,
         exposure_us=round(draft.exposure_us, 1),
     )

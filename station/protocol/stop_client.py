@@ -33,7 +33,7 @@ From a person to the wire, by files and functions in `station/` (tests/test_page
     `cli/session.py:attended`; signals to the daemon, `daemon.py:Daemon.end`; a client in control that is
     gone, `server/dispatch.py:SessionDispatcher.gone`.
   F12 in `station new`: no daemon runs yet, the dashboard alone. `tui/new_cell.py:NewCell.action_stop`,
-    `cli/new.py:GuidedArm.stop`, `devices/ur_dashboard.py:Dashboard.ask`.
+    `devices/guided.py:GuidedArm.stop`, `devices/ur_dashboard.py:Dashboard.ask`.
 
 STOP is sent to whatever listens on the socket. It is reported as done only if the genuine daemon says so on
 the motion page, a small file beside the socket that only the daemon's user can have made. It tells how many

@@ -6,7 +6,6 @@ import asyncio
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -23,11 +22,12 @@ from textual.widgets.option_list import Option
 
 from recordings.errors import CodedError
 from station.analysis.worker import preview_image
+from station.cell.config import CameraChoice
 from station.cell.errors import StationError
 from station.cell.status import DetectionStatus
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
-from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
+from station.operate.draft import STEPS, CellStep
 from station.tui.frame import BREAKPOINTS, Frame, StopBlock, fitting, next_line, rail_line
 from station.tui.live_page import LivePageApp, news
 from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
@@ -69,9 +69,9 @@ class NewCell(LivePageApp[Ending]):
     ]
     step: reactive[CellStep] = reactive(CellStep.ROBOT, init=False)
 
-    def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
+    def __init__(self, setup: CellSetup) -> None:
         super().__init__()
-        self.setup = CellSetup(hardware, root, output)
+        self.setup = setup
         self._pictures = 0
         self._news = dict[str, object]()
         """What the live page shows."""
@@ -323,6 +323,6 @@ class NewCell(LivePageApp[Ending]):
         await self.setup.close()
 
 
-def run(hardware: Hardware, root: Path, output: Path) -> Ending:
+def run(setup: CellSetup) -> Ending:
     """Open the wizard; return what to open next."""
-    return NewCell(hardware, root, output).run() or ""
+    return NewCell(setup).run() or ""

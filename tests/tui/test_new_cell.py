@@ -14,11 +14,14 @@ from textual.widgets import Input, OptionList, Static
 
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec, Image, Stamps
+from station.cell.config import CameraChoice
 from station.cell.config_file import load_config
 from station.cell.errors import CameraError, RobotError
 from station.cell.layout import guess_matrix
-from station.cli.new import RealHardware
-from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep
+from station.devices.base import Camera
+from station.devices.guided import GuidedArm, RealHardware
+from station.operate.cell_setup import CellSetup
+from station.operate.draft import CellStep
 from station.simulation.cells import make_cell
 from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
@@ -75,7 +78,9 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path, monkeypatch: p
     truth = other_cell()
     write_truth(truth, tmp_path / "truth.json")
     with start_controller(truth.robot_model, truth=tmp_path / "truth.json") as controller:
-        app = NewCell(SimulatedHardware(truth, controller.host), tmp_path, tmp_path / "station.yaml")
+        app = NewCell(
+            CellSetup(SimulatedHardware(truth, controller.host), tmp_path, tmp_path / "station.yaml")
+        )
         async with app.run_test(size=(120, 36)) as pilot:
             person = Operator(pilot, app, controller)
             await pilot.press("f12")
@@ -133,14 +138,13 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path, monkeypatch: p
 class GreyCamera(RealHardware):
     """No controller, and cameras before a grey wall."""
 
-    exposure_us = 10_000.0
     plugged: tuple[CameraChoice, ...] = (CAMERA,)
     lost = False
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
         return self.plugged
 
-    async def camera(self, found: CameraChoice) -> CameraReader:
+    async def camera(self, found: CameraChoice, exposure_us: float) -> Camera:
         return self
 
     async def glimpse(self) -> Image:
@@ -148,13 +152,11 @@ class GreyCamera(RealHardware):
             raise CameraError("camera-gone", camera="SIM00001")
         return Image(np.full((480, 640), 110, np.uint8), Stamps(), 0, 0)
 
-    async def expose(self, exposure_us: float) -> None: ...
-
     async def close(self) -> None: ...
 
 
 async def test_an_arm_that_a_program_posts_needs_a_name_a_camera_and_a_board(tmp_path: Path) -> None:
-    app = NewCell(GreyCamera(), tmp_path, tmp_path / "station.yaml")
+    app = NewCell(CellSetup(GreyCamera(), tmp_path, tmp_path / "station.yaml"))
     async with app.run_test(size=(120, 36)) as pilot:
 
         async def at(step: CellStep, *keys: str) -> None:
@@ -182,7 +184,7 @@ async def test_an_arm_that_a_program_posts_needs_a_name_a_camera_and_a_board(tmp
 
 async def test_a_camera_plugged_in_later_is_found_and_shown_before_it_is_taken(tmp_path: Path) -> None:
     hardware, other = GreyCamera(), CameraChoice("webcam", "/dev/video7", "another one")
-    app = NewCell(hardware, tmp_path, tmp_path / "station.yaml")
+    app = NewCell(CellSetup(hardware, tmp_path, tmp_path / "station.yaml"))
     async with app.run_test(size=(80, 24)) as pilot:
         await pilot.press(*"posted xArm 6", "enter")
         await until(pilot, lambda: app.setup.draft.camera == CAMERA)
@@ -203,12 +205,12 @@ async def test_a_camera_plugged_in_later_is_found_and_shown_before_it_is_taken(t
 async def test_the_wizard_says_what_it_waits_for_and_then_why_it_did_not_come(tmp_path: Path) -> None:
     hardware, answered = GreyCamera(), asyncio.Event()
 
-    async def arm(host: str) -> ArmReader:
+    async def arm(host: str) -> GuidedArm:
         await answered.wait()
         raise RobotError("model-not-told", host=host, known="UR10")
 
     hardware.arm = arm
-    app = NewCell(hardware, tmp_path, tmp_path / "station.yaml")
+    app = NewCell(CellSetup(hardware, tmp_path, tmp_path / "station.yaml"))
     async with app.run_test(size=(80, 24)) as pilot:
         await pilot.press(*"1.1.1.1", "enter")
         await until(pilot, lambda: "Wait" in str(app.query_one("#next", Static).render()))
@@ -225,7 +227,7 @@ async def test_a_disk_that_keeps_no_draft_is_told_and_the_wizard_goes_on(
 ) -> None:
     no_folder = tmp_path / "file"
     no_folder.touch()
-    app = NewCell(GreyCamera(), no_folder, tmp_path / "station.yaml")
+    app = NewCell(CellSetup(GreyCamera(), no_folder, tmp_path / "station.yaml"))
     async with app.run_test(size=(80, 24)) as pilot:
         app.step = step
         await pilot.press(key)

@@ -10,7 +10,8 @@ from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
 from recordings.schema.messages import RobotIdentity
 from station.analysis.worker import CapturedView
-from station.operate.draft import CameraChoice, Draft
+from station.cell.config import CameraChoice
+from station.operate.draft import Draft
 from station.simulation.truth import CellTruth
 from tests.calibrate.cells import inverse_nearest
 

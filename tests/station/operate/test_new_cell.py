@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, Mock
 
 import cv2
 import msgspec
@@ -14,16 +14,17 @@ import pytest
 from calibrate.boards.model import typed_board
 from calibrate.geometry import difference, inverse
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.messages import BoardKind, BoardSpec, Mount
+from recordings.schema.messages import BoardKind, BoardSpec, Image, Mount, RobotIdentity, Stamps
 from station.analysis.worker import sight
+from station.cell.config import CameraChoice
 from station.cell.config_file import load_config
 from station.cell.errors import CameraError
 from station.cell.layout import layout_of
-from station.cli.new import RealHardware
+from station.devices.guided import RealHardware
 from station.operate import draft as drafts
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
-from station.operate.draft import CameraChoice, CellStep, Draft
+from station.operate.draft import CellStep, Draft
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.cells import make_cell
 from station.simulation.renderer import Light, render
@@ -155,13 +156,42 @@ def test_views_that_fit_the_other_drawing_correct_the_mounting(
     assert setup.draft.found is not None and setup.draft.found.good
 
 
+async def test_views_count_for_the_arm_that_took_them_by_serial_or_else_by_address(
+    done: tuple[Draft, object], tmp_path: Path
+) -> None:
+    hardware, arm = AsyncMock(), Mock(close=AsyncMock())
+    hardware.arm.return_value = arm
+    setup = CellSetup(hardware, tmp_path, tmp_path / "station.yaml")
+    setup.keep(done[0])  # of 2026
+    moves = (("2026", "a", True), ("", "b", False), ("", "b", True), ("", "c", False))
+    for serial, host, kept in moves:
+        arm.identity = RobotIdentity(serial=serial)
+        await setup.connect(host)
+        assert bool(setup.draft.views) is kept
+        setup.change(views=done[0].views)
+
+
+@pytest.mark.parametrize("us_a_grey", [9.0, 91.0, 400.0])
+async def test_a_camera_is_opened_anew_until_paper_is_grey(us_a_grey: float, tmp_path: Path) -> None:
+    opened: list[AsyncMock] = []
+
+    def camera(_: CameraChoice, exposure_us: float) -> AsyncMock:
+        grey = np.full((4, 4), min(255, exposure_us / us_a_grey), np.uint8)
+        opened.append(AsyncMock(glimpse=AsyncMock(return_value=Image(grey, Stamps(), 0, 0))))
+        return opened[-1]
+
+    setup = CellSetup(AsyncMock(camera=AsyncMock(side_effect=camera)), tmp_path, tmp_path / "station.yaml")
+    await setup.open(CameraChoice("webcam", "0", "a webcam"))
+    assert 60 < setup.draft.exposure_us / us_a_grey < 170 and setup.camera is opened[-1]
+    assert [one.close.await_count for one in opened] == [1] * (len(opened) - 1) + [0]
+
+
 async def test_a_camera_without_an_image_is_closed(tmp_path: Path) -> None:
     hardware, camera = AsyncMock(), AsyncMock()
     hardware.camera.return_value, camera.glimpse.side_effect = camera, CameraError("no-image", limit_s=1.0)
+    setup = CellSetup(hardware, tmp_path, tmp_path / "station.yaml")
     with pytest.raises(CameraError):
-        await CellSetup(hardware, tmp_path, tmp_path / "station.yaml").open(
-            CameraChoice("webcam", "0", "a webcam")
-        )
+        await setup.open(CameraChoice("webcam", "0", "a webcam"))
     camera.close.assert_awaited_once()
 
 

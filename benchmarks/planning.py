@@ -37,7 +37,7 @@ from calibrate.views import Observations, extent_of
 from station.cell.errors import LimitError
 from station.cell.layout import layout_of
 from station.cell.limits import check_plan
-from station.plan.choose import choose, informations, objective_for
+from station.plan.choose import camera_objective, choose, informations
 from station.plan.planner import PlanOptions, candidate_pool, plan_layout
 from station.plan.visibility import ViewRange
 
@@ -90,7 +90,7 @@ def _compare_choices(cell: RandomCell, result: CellResult, rng: np.random.Genera
         options = PlanOptions(seed=seed, noise=MID, view=view)
         pool, _ = candidate_pool(scene, options, cell.start, rng)
         each = informations(scene, pool.base_from_flange, noise=MID)
-        objective = objective_for(scene, "A", True)
+        objective = camera_objective(scene.camera, scene.board, scene.working_distance_m, True)
         for label, sets in (
             (f"{name} planned 25", [choose(each, 25, objective, rng)] * VISITS),
             (f"{name} random 25", [rng.permutation(len(pool))[:25].tolist() for _ in range(VISITS)]),

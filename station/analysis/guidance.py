@@ -19,20 +19,18 @@ from calibrate.geometry import Array, pose, rotation_angle, rotation_exp, rotati
 from calibrate.handeye.information import (
     USUAL_NOISE,
     predicted_error_m,
-    prior_information,
     view_information,
 )
 from calibrate.handeye.metrics import median_distance_m
-from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.pnp import candidate_poses, solve_pnp
-from calibrate.projection import camera_matrix, intrinsics_names, project_pixels
+from calibrate.projection import project_pixels
 from calibrate.views import ViewSet, implied_flange
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import as_views
 from station.analysis.found_cell import FoundCell, find_cell
 from station.analysis.worker import BoardDetection, CapturedView
-from station.plan.choose import Objective
-from station.plan.visibility import distances_that_fill, outline, roll_of, visible
+from station.plan.choose import camera_objective
+from station.plan.visibility import ViewRange, camera_views, distances_that_fill, outline, roll_of, visible
 
 USUAL_FOCAL = 1.3
 """Focal length over the image's longer side that is assumed while nothing is known of the lens."""
@@ -126,15 +124,15 @@ def next_view(
         views, X, Y, noise = found.views, found.X, found.Y, found.noise
         flange, counts = views.base_from_flange, found.fit.full
     lens, at, pool = views.camera, _boards(views), _candidates(views, board, given_up)
-    prior = prior_information(lens, lens_known, BoardTolerance.of(board))
-    free = None if lens_known else slice(12, 12 + len(intrinsics_names(lens)))
     distance_m = median_distance_m(at if len(at) else pool)
-    objective = Objective("A", distance_m, prior, free)
+    objective = camera_objective(lens, board, distance_m, not lens_known)
     flange = np.concatenate([flange, implied_flange(mount, X, Y, pool)])
     each = view_information(mount, lens, flange, X, Y, points, noise)
     known, gains = np.tensordot(counts, each[: len(at)], 1), each[len(at) :]
     best = int(np.argmin(objective(known + gains)))
-    after_m = None if found is None else predicted_error_m(known + gains[best], prior, X, distance_m)
+    after_m = (
+        None if found is None else predicted_error_m(known + gains[best], objective.prior, X, distance_m)
+    )
     return NextView(mount, board, lens, at, pool[best], found, after_m)
 
 
@@ -241,17 +239,9 @@ def _candidates(views: ViewSet, board: BoardSpec, given_up: Sequence[Array]) -> 
         return pose(np.eye(3), [0.0, 0.0, (near_m + far_m) / 2] - middle)[None]
     away_m = np.linalg.norm(transform_points(at, middle[None])[:, 0], axis=1)
     reach_m = away_m.min() / _WIDER, max(min(away_m.max() * _WIDER, far_m), away_m.min())
-    rng, first = np.random.default_rng([len(at), len(given_up)]), at[0]
-    roll = roll_of(first)
-    tilt, axis = _TILT_RAD * np.sqrt(rng.uniform(0, 1, _DRAWN)), rng.uniform(-np.pi, np.pi, _DRAWN)
-    tilts, rolls = np.zeros((2, _DRAWN, 3))
-    tilts[:, 0], tilts[:, 1] = tilt * np.cos(axis), tilt * np.sin(axis)
-    rolls[:, 2] = roll + rng.uniform(-_ROLL_RAD, _ROLL_RAD, _DRAWN)
-    R = rotation_exp(tilts) @ rotation_exp(rolls)
-    pixels = (0.5 + _MIDDLE * rng.uniform(-0.5, 0.5, (_DRAWN, 2))) * [lens.width, lens.height]
-    rays = np.concatenate([pixels, np.ones((_DRAWN, 1))], axis=1) @ np.linalg.inv(camera_matrix(lens)).T
-    rays *= rng.uniform(reach_m[0], reach_m[1], (_DRAWN, 1)) / np.linalg.norm(rays, axis=1, keepdims=True)
-    pool = pose(R, rays - R @ middle)
+    wanted = ViewRange(reach_m, (0.0, _TILT_RAD), _ROLL_RAD, roll_of(at[0]), _MIDDLE)
+    rng = np.random.default_rng([len(at), len(given_up)])
+    pool = camera_views(lens, board, wanted, _DRAWN, rng)
     pool = pool[visible(lens, transform_points(pool, outline(board)), _BORDER * lens.width)]
     turn = rotation_angle(np.swapaxes(at[:, None, :3, :3], -1, -2) @ pool[:, :3, :3]).min(axis=0)
     near = pool[turn < _FURTHER_RAD]

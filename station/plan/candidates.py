@@ -9,15 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.model import board_points
-from calibrate.geometry import Array, pose, rotation_exp
+from calibrate.geometry import Array
 from calibrate.kinematics import inverse_many, singularity_measure
-from calibrate.projection import camera_matrix
 from station.cell.collision import Contact, margins
 from station.cell.layout import CellLayout
 from station.cell.limits import joint_bounds
 from station.plan.order import move_times
-from station.plan.visibility import ViewRange, seen_for_certain, sees_past_the_arm
+from station.plan.visibility import ViewRange, camera_views, seen_for_certain, sees_past_the_arm
 
 # Names of limits, as people read them.
 NOT_IN_PICTURE = "the whole board is not in the image"
@@ -60,28 +58,6 @@ class CandidateSet:
         )
 
 
-def camera_views(layout: CellLayout, view: ViewRange, count: int, rng: np.random.Generator) -> Array:
-    """Draw views of the board, camera_from_board (count, 4, 4), spread over the range."""
-    low, high = view.distance_m
-    distance = rng.uniform(low, high, count)
-    # A uniform cosine gives directions that are uniform on the sphere.
-    cosine = rng.uniform(np.cos(view.tilt_rad[1]), np.cos(view.tilt_rad[0]), count)
-    tilt, around = np.arccos(cosine), rng.uniform(-np.pi, np.pi, count)
-    roll = view.roll_centre_rad + rng.uniform(-view.roll_rad, view.roll_rad, count)
-    points = board_points(layout.board)
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    axis = np.stack([np.cos(around), np.sin(around), np.zeros(count)], axis=1)
-    turn = rotation_exp(axis * tilt[:, None])
-    rolled = rotation_exp(np.stack([np.zeros(count), np.zeros(count), roll], axis=1))
-    R = rolled @ turn
-    K = camera_matrix(layout.camera)
-    half = np.array([layout.camera.width, layout.camera.height]) / 2
-    aim = half + view.off_centre * half * rng.uniform(-1, 1, (count, 2))
-    ray = np.concatenate([(aim - K[:2, 2]) / np.diag(K)[:2], np.ones((count, 1))], axis=1)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    return pose(R, distance[:, None] * ray - R @ centre)
-
-
 def find_candidates(
     layout: CellLayout,
     view: ViewRange,
@@ -94,7 +70,7 @@ def find_candidates(
 
     `tries` (None: `count`) views are drawn; the first `count` that certainly show the board are used.
     """
-    views = camera_views(layout, view, tries or count, rng)
+    views = camera_views(layout.camera, layout.board, view, tries or count, rng)
     flange = layout.base_from_flange(views)
     seen = seen_for_certain(layout, flange, view)
     lost = Counter({NOT_IN_PICTURE: int((~seen).sum())})

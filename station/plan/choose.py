@@ -21,6 +21,7 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.projection import intrinsics_names
+from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.layout import CellLayout
 from station.cell.pose_plan import Criterion
 
@@ -28,7 +29,7 @@ Aim = Literal["camera", "arm"]
 CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm"}
 """Aim of a plan, as users name it → criterion."""
 _LENS_SHARE = 0.02
-"""Weight of the lens in criterion A, so that the views cover the image."""
+"""Weight of the lens beside X, so that the views cover the image."""
 LINK_ERROR_MM = 0.3
 """1σ of the errors of an arm's links, assumed in planning, mm and mrad."""
 _SWEEPS = 6
@@ -40,45 +41,32 @@ evaluated exactly."""
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Cost of a set of views: smaller is better. Works on information matrices (..., p, p)."""
+    """Cost of a set of views: smaller is better. Works on information matrices (..., p, p), C their inverse.
 
-    criterion: Criterion
-    lever_m: float
-    """Distance at which rotation errors are converted to metres."""
+    log trace(W C), and where the lens is estimated `_LENS_SHARE` · log det of its part of C.
+    """
+
     prior: Array
     """(p, p) prior information."""
-    lens: slice | None
-    """Indices of the intrinsics if they are estimated from the same images; None where they are known."""
-    workspace: Array | None = None
-    """(p, p) K: the mean squared error of a point over the arm's workspace is trace(K C)."""
+    weights: Array
+    """(p, p) W: trace(W C) is the mean squared error, m², that shall be small."""
+    lens: slice | None = None
+    """Indices of the intrinsics, where they are estimated from the same images; else None."""
 
     def __call__(self, information: Array) -> Array:
-        if self.criterion == "arm":
-            assert self.workspace is not None
-            C = covariance_of(information, self.prior)
-            return np.asarray(np.log(np.einsum("ij,...ji->...", self.workspace, C)))
-        covariance = covariance_of(information, self.prior)
-        diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)
-        spread = diagonal[..., :3].sum(axis=-1) + self.lever_m**2 * diagonal[..., 3:6].sum(axis=-1)
-        return np.asarray(np.log(spread) + _LENS_SHARE * self._lens(covariance))
+        C = covariance_of(information, self.prior)
+        cost = np.log(np.einsum("ij,...ji->...", self.weights, C))
+        if self.lens is not None:
+            cost = cost + _LENS_SHARE * np.linalg.slogdet(C[..., self.lens, self.lens])[1]
+        return np.asarray(cost)
 
     def slope(self, information: Array) -> Array:
         """Compute G (p, p): adding dM to the information changes the value by -trace(G dM), first order."""
         C = covariance_of(information, self.prior)
-        if self.criterion == "arm":
-            assert self.workspace is not None
-            return np.asarray(C @ self.workspace @ C / np.trace(self.workspace @ C))
-        weight, inner = np.repeat([1.0, self.lever_m**2], 3), np.zeros_like(C)
-        inner[:6, :6] = np.diag(weight / (weight * np.diag(C)[:6]).sum())
+        inner = self.weights / np.trace(self.weights @ C)
         if self.lens is not None:
-            lens = C[self.lens, self.lens]
-            inner[self.lens, self.lens] = _LENS_SHARE * np.linalg.inv(lens)
+            inner[self.lens, self.lens] += _LENS_SHARE * np.linalg.inv(C[self.lens, self.lens])
         return np.asarray(C @ inner @ C)
-
-    def _lens(self, covariance: Array) -> Array:
-        if self.lens is None:
-            return np.zeros(covariance.shape[:-2])
-        return np.asarray(np.linalg.slogdet(covariance[..., self.lens, self.lens])[1])
 
 
 def informations(
@@ -96,29 +84,30 @@ def informations(
     )
 
 
-def objective_for(
-    layout: CellLayout, criterion: Criterion, free_intrinsics: bool, joints_rad: Array | None = None
+def camera_objective(
+    camera: CameraModel, board: BoardSpec, distance_m: float, free_intrinsics: bool
 ) -> Objective:
-    """Make the objective of a criterion.
+    """Make the objective for X: its position, and its rotation as seen at this distance.
 
-    `joints_rad`: (n, 6) postures that stand for the workspace, needed by the criterion with the arm's links.
+    `free_intrinsics`: the lens is estimated from the same images.
     """
-    link_mm = LINK_ERROR_MM if criterion == "arm" else 0.0
-    prior = prior_information(layout.camera, not free_intrinsics, BoardTolerance.of(layout.board), link_mm)
-    lens = slice(12, 12 + len(intrinsics_names(layout.camera))) if free_intrinsics else None
-    K = None
-    if joints_rad is not None and link_mm:
-        chain, room = chain_of(layout.geometry.model), sample_workspace(layout.geometry.model, joints_rad)
-        over = Workspace.of(
-            layout.mount,
-            chain.forward(room),
-            chain.by_links(room),
-            layout.X,
-            layout.Y,
-            layout.working_distance_m,
-        )
-        K = over.among(len(prior))
-    return Objective(criterion, layout.working_distance_m, prior, lens, K)
+    prior = prior_information(camera, not free_intrinsics, BoardTolerance.of(board))
+    weights = np.zeros_like(prior)
+    weights[range(6), range(6)] = np.repeat([1.0, distance_m**2], 3)
+    lens = slice(12, 12 + len(intrinsics_names(camera))) if free_intrinsics else None
+    return Objective(prior, weights, lens)
+
+
+def arm_objective(layout: CellLayout, free_intrinsics: bool, joints_rad: Array) -> Objective:
+    """Make the objective for X and the arm's links, over the workspace that postures (n, 6) stand for."""
+    prior = prior_information(
+        layout.camera, not free_intrinsics, BoardTolerance.of(layout.board), LINK_ERROR_MM
+    )
+    chain, room = chain_of(layout.geometry.model), sample_workspace(layout.geometry.model, joints_rad)
+    over = Workspace.of(
+        layout.mount, chain.forward(room), chain.by_links(room), layout.X, layout.Y, layout.working_distance_m
+    )
+    return Objective(prior, over.among(len(prior)))
 
 
 def choose(

@@ -27,7 +27,7 @@ from station.plan.candidates import (
     best_group,
     find_candidates,
 )
-from station.plan.choose import Objective, choose, informations, objective_for
+from station.plan.choose import Objective, arm_objective, camera_objective, choose, informations
 from station.plan.order import ordered
 from station.plan.visibility import ViewRange, expected_view, planned_pose, view_range, visible
 
@@ -196,8 +196,12 @@ def _choose_and_order(
     progress: Progress,
 ) -> Plan:
     """Choose and order poses, and check the plan; repeat without poses that no free path leads to."""
-    joints = pool.joints_rad if options.criterion == "arm" else None
-    objective = objective_for(layout, options.criterion, options.free_intrinsics, joints)
+    free, joints = options.free_intrinsics, None
+    if options.criterion == "arm":
+        joints = pool.joints_rad
+        objective = arm_objective(layout, free, joints)
+    else:
+        objective = camera_objective(layout.camera, layout.board, layout.working_distance_m, free)
     information = informations(layout, pool.base_from_flange, joints, options.noise)
     left = np.arange(len(pool))
     picked: list[int] = []

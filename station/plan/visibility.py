@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, transform_points
+from calibrate.geometry import Array, pose, rotation_exp, transform_points
 from calibrate.kinematics import forward
 from calibrate.projection import camera_matrix, project
 from recordings.schema.messages import BoardSpec, CameraModel
@@ -58,6 +58,30 @@ def distances_that_fill(camera: CameraModel, board: BoardSpec) -> tuple[float, f
     picture = np.array([camera.width, camera.height])
     full_m = float((np.diag(camera_matrix(camera))[:2] * size_m / picture).max())
     return full_m / _NEAR_FILL, full_m / _FAR_FILL
+
+
+def camera_views(
+    camera: CameraModel, board: BoardSpec, view: ViewRange, count: int, rng: np.random.Generator
+) -> Array:
+    """Draw views of the board, camera_from_board (count, 4, 4), spread over the range."""
+    low, high = view.distance_m
+    distance = rng.uniform(low, high, count)
+    # A uniform cosine gives directions that are uniform on the sphere.
+    cosine = rng.uniform(np.cos(view.tilt_rad[1]), np.cos(view.tilt_rad[0]), count)
+    tilt, around = np.arccos(cosine), rng.uniform(-np.pi, np.pi, count)
+    roll = view.roll_centre_rad + rng.uniform(-view.roll_rad, view.roll_rad, count)
+    points = board_points(board)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    axis = np.stack([np.cos(around), np.sin(around), np.zeros(count)], axis=1)
+    turn = rotation_exp(axis * tilt[:, None])
+    rolled = rotation_exp(np.stack([np.zeros(count), np.zeros(count), roll], axis=1))
+    R = rolled @ turn
+    K = camera_matrix(camera)
+    half = np.array([camera.width, camera.height]) / 2
+    aim = half + view.off_centre * half * rng.uniform(-1, 1, (count, 2))
+    ray = np.concatenate([(aim - K[:2, 2]) / np.diag(K)[:2], np.ones((count, 1))], axis=1)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    return pose(R, distance[:, None] * ray - R @ centre)
 
 
 def visible(camera: CameraModel, points: Array, border_px: float) -> NDArray[np.bool_]:

@@ -51,7 +51,7 @@ def test_who_follows_it_from_nothing_finds_the_camera(mount: Mount) -> None:
     without, elsewhere = views[:-1], views[-1].base_from_flange + np.eye(4, k=3) * 0.1
     wrong = CapturedView(views[-1].index, elsewhere, views[-1].indices, views[-1].pixels)
     known, same = (next_view(mount, BOARD, BLANK, False, seen) for seen in (without, [*without, wrong]))
-    assert same.after_m == pytest.approx(known.after_m, rel=0.02), "what contradicts the others tells nothing"
+    assert same.after_m == pytest.approx(known.after_m, rel=0.04), "what contradicts the others tells nothing"
 
 
 def test_a_view_that_was_given_up_is_not_asked_for_again() -> None:

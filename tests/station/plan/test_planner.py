@@ -25,7 +25,7 @@ from station.cell.config import SPEED_CAP_M_S
 from station.cell.layout import cell_geometry, layout_of
 from station.cell.limits import check_plan
 from station.plan.candidates import NOT_IN_PICTURE, OUT_OF_REACH, find_candidates
-from station.plan.choose import choose, informations, objective_for
+from station.plan.choose import arm_objective, camera_objective, choose, informations
 from station.plan.planner import PlanOptions, make_plan, plan_layout
 from station.plan.visibility import ViewRange, lens_radius, view_range, visible
 from station.simulation.cells import cell_config, make_cell
@@ -121,7 +121,7 @@ def test_the_choice_beats_random_poses_of_the_same_pool_and_keeps_what_is_chosen
     rng = np.random.default_rng(0)
     pool = find_candidates(scene, replace(view_range(scene), doubt=0.0), 200, rng, None)
     each = informations(scene, pool.base_from_flange)
-    objective = objective_for(scene, "A", True)
+    objective = camera_objective(scene.camera, scene.board, scene.working_distance_m, True)
     best = float(objective(each[choose(each, 15, objective, rng)].sum(axis=0)))
     scores = [float(objective(each[rng.permutation(len(each))[:15]].sum(axis=0))) for _ in range(40)]
     assert best < min(scores)
@@ -137,7 +137,7 @@ def test_poses_for_the_arm_tell_more_of_its_table_than_poses_for_the_camera():
         plan = plan_layout(scene, PlanOptions(pool=600, criterion=criterion), truth.start_joints_rad)
         joints = np.array([pose.joints_rad for pose in plan.poses])
         gained = informations(scene, forward(scene.geometry.model, joints), joints).sum(axis=0)
-        error_m.append(np.exp(objective_for(scene, "arm", True, joints)(gained) / 2))
+        error_m.append(np.exp(arm_objective(scene, True, joints)(gained) / 2))
     assert error_m[0] < 0.95 * error_m[1]
 
 
@@ -231,7 +231,7 @@ def test_six_poses_for_a_known_lens_tell_more_of_where_the_camera_sits():
     """A drift check asks for them so: the installed calibration knows the lens."""
     truth, config = cell()
     scene, errors_m = layout_of(config), []
-    prior = objective_for(scene, "A", False).prior
+    prior = camera_objective(scene.camera, scene.board, scene.working_distance_m, False).prior
     for known in (False, True):
         options = replace(FEW, count=6, free_intrinsics=not known)
         plan = plan_layout(scene, options, truth.start_joints_rad)

@@ -70,7 +70,7 @@ def put(
         return folder
 
     def seen(held, given, paths, progress):
-        key = (given, json.dumps(held.facts), len(paths))
+        key = (given, tuple(board._described(held.facts)), len(paths))
         if key not in _SEEN:
             _SEEN[key] = board.see_board(held, given, paths, progress)
         found = _SEEN[key]
@@ -312,7 +312,7 @@ def test_pairs_of_poses_are_a_recording_without_pictures(tmp_path: Path) -> None
 def test_one_of_two_tables_is_named_the_robots_and_a_reading_told_whole_is_taken(tmp_path: Path) -> None:
     """A poor arm is not refused for its noise: gates judge it. Told wrongly it is, by name."""
     rng = np.random.default_rng(3)
-    robot, board = TURNED.flange_poses()[0].copy(), np.array(TURNED.camera_from_board())
+    robot, board = TURNED.flange_poses()[0][:8], np.array(TURNED.camera_from_board())[:8]
     np.savetxt(tmp_path / "b.txt", quaternions(board))
     for noise_m in (0.0, 0.03):
         robot[:, :3, 3] += noise_m * rng.standard_normal((len(robot), 3))
@@ -321,12 +321,10 @@ def test_one_of_two_tables_is_named_the_robots_and_a_reading_told_whole_is_taken
         with raises("no-pairs"):
             believe(look(tmp_path))
         held = look(tmp_path, Path("a.txt"))
-        if noise_m:
-            with raises("no-reading", nearest="a.txt: eye-in-hand, rotvec"):
-                believe(held, Given(mount="eye-in-hand"))
         found = believe(held, Given("ur-rotvec", "eye-in-hand"))
         np.testing.assert_allclose([row.base_from_flange for row in found.rows], robot, atol=1e-6)
-        with raises("no-reading" if noise_m else "other-convention"):
+        wrong = {"nearest": "a.txt: eye-in-hand, rotvec"} if noise_m else {"fits": "rotvec"}
+        with raises("no-reading" if noise_m else "other-convention", **wrong):
             believe(held, Given("euler-ZYX", "eye-in-hand"))
 
 

@@ -84,6 +84,8 @@ class Bag(ABC):
 
 def open_bag(path: Path, progress: Progress = lambda done, total, text: None) -> Bag:
     """A bag's folder, or one file; MCAP is proven first. Raises ImportSourceError or RecordingError."""
+    if not path.exists():
+        raise ImportSourceError("no-file", path=path)
     if path.is_dir():
         mcap, ros = sorted(path.glob("*.mcap")), sorted(path.glob("*.bag"))
         if not ros and any(file.suffix in (".db3", ".zstd") for file in path.iterdir()):

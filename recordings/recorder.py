@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from recordings.errors import RecordingError
 from recordings.schema.messages import (
-    CameraModel,
     CaptureEvent,
     Image,
     Matrix4,
@@ -95,9 +94,6 @@ class Recorder:
 
     def event(self, event: CaptureEvent) -> None:
         self._put(lambda: self._writer.event(event))
-
-    def camera_model(self, model: CameraModel) -> None:
-        self._put(lambda: self._writer.camera_model(model))
 
     def corners(self, sequence: int, pixels: NDArray[np.float64]) -> None:
         """Detected corners (n, 2) of a recorded image, for viewers."""

@@ -158,7 +158,6 @@ class SessionRecording:
                 recorder.attach(ARM_KINEMATICS_NAME, "application/json", msgspec.json.encode(kinematics))
             for name, content in self._cell.attachments.items():
                 recorder.attach(name, "application/json", content)
-            recorder.camera_model(info.camera)
         except BaseException:
             recorder.close()
             raise

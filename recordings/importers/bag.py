@@ -14,12 +14,7 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recordings.errors import (
-    ImportSourceError,
-    UnfinishedRecordingError,
-    recover_line,
-    wrong_size_error,
-)
+from recordings.errors import ImportSourceError, wrong_size_error
 from recordings.images import (
     KEPT_FORMATS,
     ImageError,
@@ -30,7 +25,7 @@ from recordings.images import (
     raw_array,
     read_header,
 )
-from recordings.importers.bags import UNFINISHED, open_bag
+from recordings.importers.bags import open_bag
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
 from recordings.importers.folder import Imported
 from recordings.importers.messages import ImageMessage, Progress
@@ -57,14 +52,9 @@ def import_bag(
 
     `description`: a dataset.yaml with mount and board (default: the one in or beside the source).
     """
-    if not source.exists():
-        raise ImportSourceError("no-file", path=source)
-    if source.name.endswith(UNFINISHED):
-        reason, rescue = "it was never finished", recover_line(source)
-        raise UnfinishedRecordingError(path=source, reason=reason, rescue=rescue)
-    described, description_bytes = _description(source, description, needed=output is not None)
-    bag = open_bag(source, progress)
+    bag = open_bag(source, progress)  # what is wrong with the source comes before what it lacks
     try:
+        described, description_bytes = _description(source, description, needed=output is not None)
         chosen = select(bag, wanted)
         images_ns = np.fromiter((image.stamp_ns for image in bag.images(chosen.image.name)), np.int64)
         joints = chosen.joints

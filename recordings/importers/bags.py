@@ -18,8 +18,8 @@ from recordings.mcap.scan import scan_file
 from recordings.mcap.source import Source
 from recordings.schema.definitions import SESSION_RECORDS
 
-UNFINISHED = ".mcap" + PART_SUFFIX
-BAGS = (".mcap", UNFINISHED, ".bag", ".db3", ".zstd")
+_UNFINISHED = ".mcap" + PART_SUFFIX
+BAGS = (".mcap", _UNFINISHED, ".bag", ".db3", ".zstd")
 """Ends of the names of files of bags, and of a recording that was not finished."""
 _RESCUE = "mcap recover FILE, with the mcap command line tool"
 _SHOWN_EVERY = 64
@@ -108,7 +108,8 @@ class _McapBag(Bag):
             descriptor = open_file(path)
             try:
                 told = partial(self._checked, done, total)
-                contents, source, _ = scan_file(descriptor, path, _RESCUE, told)
+                rescue = "" if path.name.endswith(_UNFINISHED) else _RESCUE
+                contents, source, _ = scan_file(descriptor, path, rescue, told)
                 if SESSION_RECORDS[0] in contents.metadata:
                     raise ImportSourceError("a-recording", path=path)
             except BaseException:

@@ -243,9 +243,10 @@ def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -
     assert json.loads(result.stdout) == {"recording": str(output), "views": 3, "bytes": output.stat().st_size}
 
 
-def test_a_source_that_is_unfinished_or_not_there_is_named_not_its_folder(small: Path) -> None:
-    part = small.rename(small.with_name("a.mcap.part"))
-    for source, code in ((part, "unfinished-recording"), (small, "no-file")):
+def test_a_source_that_is_none_is_named_before_what_it_lacks(small: Path) -> None:
+    (part := small.with_name("a.mcap.part")).write_bytes(small.read_bytes()[:-9000])
+    missing = small.with_name("none.mcap")
+    for source, code in ((part, "unfinished-recording"), (small, "a-recording"), (missing, "no-file")):
         told = call(main, "import", source, "-o", small.with_name("out.mcap"), "--json")
         assert json.loads(told.stdout)["error"]["code"] == code
 

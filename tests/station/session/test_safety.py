@@ -22,10 +22,13 @@ from station.protocol.verbs import MakePlan, Purpose, Skip
 from station.server.connections import ClientServer
 from station.server.dispatch import SessionDispatcher
 from station.session import device_connector, supervisor
+from station.session.motion import START_TOLERANCE_RAD
 from station.session.recording import SessionRecording
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
-from tests.station.session_rig import POSES, HeldDisk, NewRig, Rig
+from tests.station.session_rig import POSES, TRUTH, HeldDisk, NewRig, Rig
+
+FIRST, *OTHERS = TRUTH.start_joints_rad
 
 
 class Gate:
@@ -66,6 +69,31 @@ async def test_an_offer_does_not_outlive_the_sleep_of_its_computer(rig: Rig, mon
     monkeypatch.setattr(time, "clock_gettime", lambda number: clock(number) + slept_s.get(number, 0.0))
     with raises("approval-expired"):
         await rig.session.go(1, token)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code"),
+    [
+        ({"token": "guess"}, "approval-used"),
+        ({"client_id": 2}, "approval-of-another"),
+        ({"sha256": "cd" * 32}, "plan-changed"),
+        ({"joints_rad": (FIRST + 2 * START_TOLERANCE_RAD, *OTHERS)}, "arm-moved"),
+    ],
+)
+async def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
+    rig: Rig, wrong: dict[str, Any], code: str
+) -> None:
+    shown, redeem = await rig.session.prepare(1, Purpose.RUN), rig.session.approvals.redeem
+    right = {
+        "token": shown.token,
+        "client_id": 1,
+        "sha256": shown.approval_sha256,
+        "joints_rad": rig.arm.joints,
+    }
+    with raises(code):
+        redeem(**(right | wrong))
+    with raises("approval-used"):
+        redeem(**right)
 
 
 @pytest.mark.parametrize("state", [S.STOPPED, S.FAULT])

@@ -1,4 +1,4 @@
-"""Builds MCAP files byte by byte, so that a test can lie in one place and be right everywhere else."""
+"""Builds MCAP files record by record, so that a test can lie in one place and be right everywhere else."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import zlib
 from pathlib import Path
 
 import msgspec
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
 
 from recordings.mcap.records import MAGIC, with_crc
 from recordings.schema.definitions import FORMATS
@@ -25,22 +27,22 @@ def text(value: str | bytes) -> bytes:
     return struct.pack("<I", len(raw)) + raw
 
 
-def text_map(content: dict[str, str]) -> bytes:
-    return text(b"".join(text(key) + text(value) for key, value in content.items()))
+def built(of: McapRecord) -> bytes:
+    of.write(builder := RecordBuilder())
+    return builder.end()
 
 
 def schema(number: int, topic: Topic) -> bytes:
     name, data = schema_name(topic), schema_bytes(topic)
-    return record(Opcode.SCHEMA, struct.pack("<H", number) + text(name) + text("protobuf") + text(data))
+    return built(Schema(id=number, data=data, encoding="protobuf", name=name))
 
 
 def channel(number: int, schema_id: int, topic: str) -> bytes:
-    content = struct.pack("<HH", number, schema_id) + text(topic) + text("protobuf") + text_map({})
-    return record(Opcode.CHANNEL, content)
+    return built(Channel(number, topic, "protobuf", {}, schema_id))
 
 
 def message(number: int, data: bytes, sequence: int = 0, time_ns: int = 5) -> bytes:
-    return record(Opcode.MESSAGE, struct.pack("<HIQQ", number, sequence, time_ns, time_ns) + data)
+    return built(Message(number, time_ns, data, time_ns, sequence))
 
 
 def chunk(
@@ -51,25 +53,25 @@ def chunk(
     crc: int | None = None,
 ) -> bytes:
     """`size`, `crc`: the lie, when given."""
-    content = records if stored is None else stored
-    return record(
-        Opcode.CHUNK,
-        struct.pack(
-            "<QQQI", 5, 5, len(records) if size is None else size, zlib.crc32(records) if crc is None else crc
+    return built(
+        Chunk(
+            compression=compression,
+            data=records if stored is None else stored,
+            message_end_time=5,
+            message_start_time=5,
+            uncompressed_crc=zlib.crc32(records) if crc is None else crc,
+            uncompressed_size=len(records) if size is None else size,
         )
-        + text(compression)
-        + struct.pack("<Q", len(content))
-        + content,
     )
 
 
 def metadata(name: str, content: dict[str, str]) -> bytes:
-    return record(Opcode.METADATA, text(name) + text_map(content))
+    return built(Metadata(name, content))
 
 
-def attachment(name: str | bytes, data: bytes, crc: int | None = None) -> bytes:
-    content = struct.pack("<QQ", 0, 0) + text(name) + text("text/plain") + struct.pack("<Q", len(data)) + data
-    return record(Opcode.ATTACHMENT, content + struct.pack("<I", zlib.crc32(content) if crc is None else crc))
+def attachment(name: str, data: bytes, crc: int | None = None) -> bytes:
+    whole = built(Attachment(0, 0, name, "text/plain", data))
+    return whole if crc is None else whole[:-4] + struct.pack("<I", crc)
 
 
 def session_metadata(info: SessionInfo | None = None, file_format: str = FORMATS[-1]) -> bytes:

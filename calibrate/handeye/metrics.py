@@ -25,11 +25,8 @@ _MIN_SECOND_AXIS_RAD = np.radians(0.3)
 class Observability:
     """The direction in which X is known worst, and the rotations that the views hold."""
 
-    weakest_direction: Array
-    """(6,) unit [δt, δφ] in X's parent frame, rotation weighed at the working distance."""
     weakest_text: str
-    weakest_sigma_m: float
-    """1σ along `weakest_direction`, as metres at the working distance."""
+    """That direction in X's parent frame, and 1σ along it, rotation weighed at the working distance."""
     largest_angle_rad: float
     """Largest rotation between any two views."""
     axis_spread: float
@@ -162,9 +159,7 @@ def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> 
     )
     singular, _ = axis_spread(pairs.alpha)
     return Observability(
-        weakest_direction=worst,
         weakest_text=text,
-        weakest_sigma_m=sigma,
         largest_angle_rad=float(screw_invariants(pairs.A)[0].max()),
         axis_spread=float(singular[1] / max(singular[0], 1e-300)),
     )

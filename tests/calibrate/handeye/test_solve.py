@@ -195,6 +195,7 @@ def mirrored(C):
     [
         ("base_from_flange", lambda F: F * np.nan, "robot-pose"),
         ("base_from_flange", lambda F: F * 2, "robot-pose"),
+        ("camera_from_board", lambda C: None, "no-board-pose"),
         ("camera_from_board", mirrored, "board-pose"),
         ("camera_from_board", lambda C: C @ pose(np.eye(3), [0, 0, -9.0]), "board-pose"),
         ("pixels", lambda p: p * np.nan, "corners"),

@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibrate.geometry import pose, rotation_exp
-from calibrate.handeye.axxb.evolution import EvolutionSettings, _partners, evolve
 from calibrate.handeye.axxb.pairs import consecutive_pairs
-from calibrate.handeye.axxb.paper import BOX, SETTINGS, solve_paper
+from calibrate.handeye.axxb.paper import BOX, SETTINGS, EvolutionSettings, _partners, evolve, solve_paper
 from tests.calibrate.cells import LOW, make_cell
 
 ROOT = Path(__file__).parents[4]

@@ -98,13 +98,12 @@ def drift_check(
         text = check_text(result, calibration)
         own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
     try:
-        if version is not None and production and not result.passed:  # no alarm is no proof
-            verdict = _judged(result, source.name)
-            validity = note_check(root, *verdict, datetime.now(UTC), camera=camera, version=version)
-        elif version is not None and not production and not own:
+        # Production pictures without an alarm prove nothing, and neither do the calibration's own views.
+        if version is not None and not own and not (production and result.passed):
             verdict = _judged(result, info.name)
             validity = note_check(root, *verdict, _taken(info), camera=camera, version=version)
-            before, trend = _log(result, calibration, info, prepared.loaded.board, root, camera, version)
+            if not production:
+                before, trend = _log(result, calibration, info, prepared.loaded.board, root, camera, version)
     except InstallError as problem:
         if problem.code == "other-version":
             raise

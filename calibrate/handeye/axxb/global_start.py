@@ -74,7 +74,6 @@ def _descend(objective: QuadraticObjective, R: Array) -> Array:
         values, V = np.linalg.eigh(H)
         size = np.abs(values).max() + 1e-300
         step = -V @ (V.T @ P @ gamma / (np.maximum(np.abs(values), 1e-10 * size) + damping * size))
-        step /= max(1.0, float(np.linalg.norm(step)))
         trial = rotation_exp(step) @ R
         if (ahead := value(trial)) <= f:
             R, f, damping = trial, ahead, damping / 10

@@ -56,8 +56,9 @@ def test_what_is_installed_is_valid_until_a_check_contradicts_it_and_again_when_
     for require in (None, True):
         with raises("calibration-in-doubt", InstallError, version=1, reason="drift-check"):
             load_installed(root, require_valid=require)
-    assert check(root, passed=True).state is V
-    assert load_installed(root).validity.verified > doubted.validity.verified
+    valid = note_check(root, MOVED, True, True, datetime.now(UTC) + timedelta(hours=1))
+    assert valid.state is V and valid.since == valid.verified > doubted.validity.verified
+    assert check(root, passed=True).since == valid.since
 
 
 def test_a_pass_that_could_have_missed_the_shift_proves_nothing(root: Path) -> None:

@@ -83,7 +83,7 @@ def export(
     ] = "",
     driver_tf: Annotated[
         list[Path] | None,
-        typer.Option(help="The driver's static transforms: bag, URDF or `ros2 topic echo /tf_static`"),
+        typer.Option(help="The driver's static transforms: URDF or `ros2 topic echo /tf_static`"),
     ] = None,
     arm: Annotated[
         Path | None, typer.Option("--arm", help="urdf: your arm's URDF, to be written as the corrected arm")

@@ -17,29 +17,28 @@ from calibrate.files.exports.robot import Urdf, origin_of
 from calibrate.files.integrity import read_bounded
 from calibrate.geometry import quaternion_from_matrix
 from recordings import strict_yaml
-from recordings.importers.bags import open_bag
 from recordings.importers.frames import FrameTree
-from recordings.importers.messages import FrameMessage, Kind
+from recordings.importers.messages import FrameMessage
 
 _NO_TRANSFORMS = (
     AttributeError, KeyError, TypeError, ValueError,
     expat.ExpatError, ElementTree.ParseError, strict_yaml.StrictYamlError,
 )  # fmt: skip
-_BAGS = (".bag", ".db3", ".mcap")
 
 
 def fixed_frames(paths: Iterable[Path]) -> FrameTree:
-    """Read static transforms: a bag's /tf_static, a URDF's fixed joints, or YAML as
-    `ros2 topic echo /tf_static` prints it.
+    """Read static transforms: YAML as `ros2 topic echo /tf_static` prints it, or a URDF's fixed joints.
 
-    Raises UsageError for a file without any, or where a frame has two parents; ImportSourceError for a bag.
+    Raises UsageError for a file without any, or where a frame has two parents.
     """
     tree = FrameTree()
     for path in paths:
         try:
-            found = list(_of_bag(path) if path.is_dir() or path.suffix in _BAGS else _of_text(path))
+            found = list(_read(path))
         except _NO_TRANSFORMS as problem:
-            raise UsageError("no-fixed-frames", path=path, why=repr(problem)) from None
+            raise UsageError(
+                "no-fixed-frames", path=path, why=f"{type(problem).__name__}: {problem}"
+            ) from None
         if not found:
             raise UsageError("no-fixed-frames", path=path, why="there are none")
         tree.add(found)
@@ -50,18 +49,7 @@ def fixed_frames(paths: Iterable[Path]) -> FrameTree:
     return tree
 
 
-def _of_bag(path: Path) -> Iterator[FrameMessage]:
-    bag = open_bag(path)
-    try:
-        for name, topic in bag.topics.items():
-            if topic.kind is Kind.TRANSFORMS and name.endswith("tf_static"):
-                for frames in bag.values(name):
-                    yield from frames  # type: ignore[misc]  # of this kind they are lists
-    finally:
-        bag.close()
-
-
-def _of_text(path: Path) -> Iterator[FrameMessage]:
+def _read(path: Path) -> Iterator[FrameMessage]:
     content = read_bounded(path)
     text = content.decode()
     if "<robot" in text:

@@ -33,7 +33,7 @@ async def test_23_settings_changed_behind_our_back_are_refused(emulated: Emulate
             (emulated.set_number, at.EXPOSURE, 1000, 1030),
             (emulated.set_number, at.EXPOSURE, 1000, 970),
             (emulated.set_number, at.GAIN, 0, 0.3),
-            (emulated.set_register, at.WIDTH, 1280, 640),
+            (emulated.set_register, at.OFFSET_X, 0, 8),
         ):
             change(address, value)
             with raises("settings-changed"):

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
 from station.cell.errors import StationError
+from station.cell.process import die_with_parent
 
 log = logging.getLogger(__name__)
 
@@ -90,6 +92,13 @@ class Workers:
             process.kill()
         # In a thread: the event loop sends the arm's heartbeat and must not wait for a process to end.
         threading.Thread(target=_reap, args=(processes,), name="worker reaper", daemon=True).start()
+
+
+def live_with_parent() -> None:
+    """Let this process of a pool end with its parent, whatever ends it, and not by Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # at a terminal it reaches all: the parent ends its workers
+    if (parent := parent_process()) is not None and parent.pid is not None:
+        die_with_parent(parent.pid)
 
 
 def _reap(processes: list[BaseProcess]) -> None:

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import multiprocessing
 import os
-import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,8 +25,8 @@ from calibrate.lens.pnp import planar_tilts
 from calibrate.views import BoardView
 from recordings.images import Pixels, eight_bits, viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image
+from station.analysis.pool import live_with_parent
 from station.cell.pose_plan import ExpectedView
-from station.cell.process import die_with_parent
 from station.cell.status import DetectionStatus
 from station.protocol.verbs import PreviewImage
 
@@ -77,9 +75,7 @@ class BoardDetection:
 
 def start_worker() -> None:
     """Set up the worker process: low priority and one thread, to leave a processor for the capture."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches it too: the daemon ends it
-    if (parent := multiprocessing.parent_process()) is not None and parent.pid is not None:
-        die_with_parent(parent.pid)
+    live_with_parent()
     with contextlib.suppress(OSError):  # a service may not be permitted to
         os.nice(_NICENESS)
     cv2.setNumThreads(1)

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import pickle
-import subprocess
-import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import msgspec
 
 from calibrate.geometry import Array
 from recordings.schema.messages import CameraIdentity, ClockReading, Image
-from station.cell.child import ChildProcess
+from station.analysis.pool import WorkerError, Workers
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import CameraCounts, FrameTiming
-from station.devices.base import DeviceThread
 from station.devices.frames import FrameClock, FrameCounter
+from station.simulation.camera_process import ask, start_camera
 from station.simulation.truth import CellTruth
 
-START_TIMEOUT_S = 20.0
 _ANSWER_S = 5.0
 _CLOCK_READINGS = 8
 
@@ -44,8 +41,10 @@ class RenderedCamera:
             truth = msgspec.structs.replace(truth, light=msgspec.structs.replace(truth.light, **changes))
         self._truth = truth
         self._host = controller_host
-        self._process: subprocess.Popen[bytes] | None = None
-        self._thread = DeviceThread("rendered camera")
+        self._workers: Workers | None = None
+        """The camera's process; None: not open."""
+        self._lost = False
+        """Its process died, or was too late; the next one is another camera."""
         self._asking = asyncio.Lock()
         self._clock = FrameClock()
         self.counter = FrameCounter()
@@ -77,9 +76,11 @@ class RenderedCamera:
         return self.identity
 
     async def _open(self) -> None:
+        if self._workers is None:
+            self._workers = Workers(partial(start_camera, self._truth, self._host), partial(ask, "warm_up"))
+        self._lost = False
         self.counter.restart()
-        await self._thread.run(self._start)
-        await self._call(self._truth, self._host, timeout_s=START_TIMEOUT_S)
+        await self._call("clock")  # answered when the process has started
         self._clock.restart()  # not before: a clock without readings counts as unreadable
         for _ in range(_CLOCK_READINGS):
             await self._read_clock()
@@ -112,17 +113,16 @@ class RenderedCamera:
             return _dated(await self._call("preview"))
 
     async def close(self) -> None:
-        process, self._process = self._process, None
-        if process is not None:
-            process.kill()  # ends a call that is under way, too
-            await self._thread.close(ChildProcess(process).stop)
+        workers, self._workers, self._lost = self._workers, None, False
+        if workers is not None:
+            workers.close()  # ends a call that is under way, too
 
     async def _ready(self) -> None:
         """Open it again when it was lost, as other drivers do, and bring it to where a posted arm is now.
 
         CameraError where nothing is posted.
         """
-        if self._process is not None and self._process.poll() is not None:
+        if self._lost:
             await self._open()
         if self._flange is None:
             return
@@ -137,36 +137,17 @@ class RenderedCamera:
         device_ns = await self._call("clock")
         self._clock.readings.add(ClockReading(asked_ns, time.monotonic_ns(), device_ns))
 
-    async def _call(self, *request: object, timeout_s: float = _ANSWER_S) -> Any:
-        try:
-            return await asyncio.wait_for(self._thread.run(lambda: self._ask(*request)), timeout_s)
-        except TimeoutError:
-            raise CameraError("camera-silent", limit_s=timeout_s) from None
-
-    # -- in the camera's thread
-
-    def _start(self) -> None:
-        if self._process is not None:
-            ChildProcess(self._process).stop()
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "station.simulation.camera_process"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-
-    def _ask(self, *request: object) -> Any:
-        if self._process is None:
+    async def _call(self, name: str, *arguments: object, timeout_s: float = _ANSWER_S) -> Any:
+        if self._workers is None:
             raise CameraError("not-open")
-        assert self._process.stdin is not None and self._process.stdout is not None
         try:
-            self._process.stdin.write(pickle.dumps(request))
-            self._process.stdin.flush()
-            done, answer = pickle.load(self._process.stdout)
-        except (EOFError, OSError, pickle.UnpicklingError):
+            # A cancelled call would end the process.
+            return await asyncio.shield(self._workers.call(ask, name, *arguments, timeout_s=timeout_s))
+        except WorkerError:
+            self._lost = True
             raise CameraError("camera-gone", camera=self.identity.serial) from None
-        if not done:
-            raise CameraError("camera-refused", doing=str(request[0]), reason=answer)
-        return answer
+        except RobotError as error:
+            raise CameraError("camera-refused", doing=name, reason=str(error)) from None
 
 
 def _dated(frame: Image) -> Image:

@@ -1,15 +1,12 @@
-"""Process of the rendered camera: requests on standard input, answers on standard output, pickled.
+"""Process of the rendered camera.
 
-It behaves like a device: its own clock, frame ids that wrap, and exposure that takes time. It ends with its
-input.
+It behaves like a device: its own clock, frame ids that wrap, and exposure that takes time.
 """
 
 from __future__ import annotations
 
-import pickle
-import sys
 import time
-from typing import BinaryIO
+from typing import Any
 
 import cv2
 import msgspec
@@ -18,6 +15,7 @@ from numpy.typing import NDArray
 
 from calibrate.geometry import Array, inverse
 from recordings.schema.messages import CameraModel, Image, Stamps
+from station.analysis.pool import live_with_parent
 from station.cell.errors import RobotError
 from station.simulation.launch import AdminClient
 from station.simulation.renderer import render, scaled
@@ -107,24 +105,18 @@ class CameraProcess:
         return np.array(answer["base_from_flange"])
 
 
-def serve(requests: BinaryIO, answers: BinaryIO) -> None:
-    """Serve until the end of input; the first request describes the camera."""
-    camera = CameraProcess(*pickle.load(requests))
-    camera.warm_up()
-    answer: tuple[bool, object] = (True, None)
-    while True:
-        pickle.dump(answer, answers, protocol=pickle.HIGHEST_PROTOCOL)
-        answers.flush()
-        name, *arguments = pickle.load(requests)
-        try:
-            answer = (True, getattr(camera, name)(*arguments))
-        except RobotError as error:
-            answer = (False, str(error))
+_camera: CameraProcess | None = None
+"""The camera of this process."""
 
 
-if __name__ == "__main__":
+def start_camera(truth: CellTruth, controller_host: str) -> None:
+    """Make this process, a child of the daemon's, a camera."""
+    global _camera
+    live_with_parent()
     cv2.setNumThreads(1)
-    try:
-        serve(sys.stdin.buffer, sys.stdout.buffer)
-    except (EOFError, BrokenPipeError, KeyboardInterrupt):
-        sys.exit(0)  # the daemon is gone
+    _camera = CameraProcess(truth, controller_host)
+
+
+def ask(name: str, *arguments: object) -> Any:
+    """Call the camera in its process. RobotError without a controller."""
+    return getattr(_camera, name)(*arguments)

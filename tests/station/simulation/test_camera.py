@@ -77,9 +77,11 @@ async def test_without_a_controller_the_camera_says_so(cell: CellTruth) -> None:
 
 
 async def test_one_that_died_is_opened_again(camera: RenderedCamera) -> None:
-    assert camera._process is not None
-    camera._process.kill()
-    camera._process.wait()
+    assert camera._workers is not None and camera._workers._pool is not None
+    for process in camera._workers._pool._processes.values():
+        process.kill()
+    with raises("camera-gone"):
+        await camera.capture()
     await camera.capture()
 
 

@@ -235,12 +235,17 @@ class PostedArm:
         arrived_ns = time.monotonic_ns()
         if len(lines) > LINES_READ:
             self._notify(f"{self._poster} posts too fast: only the newest poses are read")
-        try:
-            found = [read_post(line, self._written) for line in lines[-LINES_READ:] if line.strip()]
-            for post, pose in found if found and found[-1][0].t is not None else found[-1:]:
-                self._add(post, pose, arrived_ns)
-        except StaleStateError as error:
-            self._wrong, self._wrong_since_s = StaleStateError.from_data(error.data), time.monotonic()
+        found = list[tuple[Post, Vector6]]()
+        for line in filter(bytes.strip, lines[-LINES_READ:]):
+            try:
+                found.append(read_post(line, self._written))
+            except StaleStateError as error:
+                self._note_wrong(error)
+        for post, pose in found if found and found[-1][0].t is not None else found[-1:]:
+            self._add(post, pose, arrived_ns)
+
+    def _note_wrong(self, error: StaleStateError) -> None:
+        self._wrong, self._wrong_since_s = StaleStateError.from_data(error.data), time.monotonic()
 
     def _add(self, post: Post, pose: Vector6, arrived_ns: int) -> None:
         before = self._states[-1] if self._states else None
@@ -276,7 +281,7 @@ class PostedArm:
             callback(self._states[-1])
         self._first_pose.set()
         if wrong is not None:
-            raise wrong
+            self._note_wrong(wrong)
 
     def _forget(self) -> None:
         """Forget what belongs to another clock."""

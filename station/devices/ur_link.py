@@ -344,8 +344,6 @@ class UrLink:
         if self.dashboard is None or not self.dashboard.alive:
             await self.renew_dashboard()
         assert self.dashboard is not None
-        if self._primary is not None and self._primary.dead:
-            self._primary = PrimaryReader(self.config.host)
         if self.remote is not None:
             with contextlib.suppress(DashboardError):
                 self.remote = await self.dashboard.remote()

@@ -43,6 +43,7 @@ CARTESIAN_INFO = 4
 KINEMATICS_INFO = 5
 MESSAGE_LIMIT = 64 * 1024
 SILENCE_S = 3.0
+RETRY_S = 0.5
 _HEADER = struct.Struct(">iB")
 _CARTESIAN = struct.Struct(">12d")
 """TCP pose, then TCP offset: x y z [m], rotation vector [rad] each"""
@@ -113,11 +114,10 @@ def _six(values: Sequence[float]) -> Vector6:
 
 
 class PrimaryReader:
-    """Reads TCP offset and kinematics until the connection ends; `dead` then says why. Sends nothing."""
+    """Reads TCP offset and kinematics, by a new connection where one ends. Sends nothing."""
 
     def __init__(self, host: str) -> None:
         self.installation = Installation()
-        self.dead = ""
         self.started = ""
         """Name of the program that started last."""
         self._host = host
@@ -132,10 +132,17 @@ class PrimaryReader:
         return self.installation
 
     async def _run(self) -> None:
-        writer = None
+        while True:
+            with contextlib.suppress(OSError, EOFError, PrimaryError):
+                await self._read()
+            self._first.set()
+            await asyncio.sleep(RETRY_S)
+
+    async def _read(self) -> None:
+        """Read until the connection ends. Raises OSError, EOFError, PrimaryError."""
+        async with asyncio.timeout(SILENCE_S):
+            reader, writer = await asyncio.open_connection(self._host, PORT, limit=MESSAGE_LIMIT)
         try:
-            async with asyncio.timeout(SILENCE_S):
-                reader, writer = await asyncio.open_connection(self._host, PORT, limit=MESSAGE_LIMIT)
             while True:
                 async with asyncio.timeout(SILENCE_S):
                     kind, payload = await _message(reader)
@@ -143,14 +150,8 @@ class PrimaryReader:
                     self._learn(read_state(payload))
                 elif kind == ROBOT_MESSAGE:
                     self.started = program_started(payload) or self.started
-        except TimeoutError:
-            self.dead = f"nothing came from {self._host}:{PORT} for {SILENCE_S:g} s"
-        except (OSError, EOFError, PrimaryError) as error:
-            self.dead = str(error) or type(error).__name__
         finally:
-            self._first.set()
-            if writer is not None:
-                writer.transport.abort()
+            writer.transport.abort()
 
     def _learn(self, news: Installation) -> None:
         known = self.installation

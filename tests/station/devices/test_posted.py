@@ -202,6 +202,15 @@ async def test_a_wrong_post_is_named_and_nothing_is_taken_until_right_ones_go_on
             await asyncio.sleep(0.02)
 
 
+async def test_a_wrong_post_costs_no_right_one_that_came_with_it(arm: PostedArm) -> None:
+    poster = await Poster.at(arm)
+    poster.post()
+    poster.say(b"nonsense\n")
+    poster.post()
+    await until(lambda: len(arm._states) == 2)
+    assert trouble(arm) == "post-unreadable"
+
+
 async def test_a_program_that_falls_silent_or_is_killed_is_named(arm: PostedArm) -> None:
     poster = await Poster.at(arm)
     await poster.rest(5)

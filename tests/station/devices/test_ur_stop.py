@@ -58,7 +58,7 @@ async def robot(ways: Ways, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(ur, "LEFTOVER_WAIT_S", 0)
     made: Any = UrRobot(RobotConfig(model="UR10", host="127.0.0.1"), tmp_path)
     monkeypatch.setattr(made, "_dashboard_stop_anew", ways.anew)
-    made.dashboard, made._child, made._controls = ways, ways, True
+    made.dashboard, made._child, made.control = ways, ways, True
     return made
 
 

@@ -18,7 +18,7 @@ from station.simulation.controller.primary import state
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
 from tests.codes import raises
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, until
 from tests.recordings.small_recording import PLAYING
 
 UR10 = MODELS["UR10"]
@@ -154,7 +154,7 @@ async def test_a_controller_that_is_slow_to_state_its_tool_is_waited_for(
         writer.write(state(made, first=True))
         writer.close()
 
-    host = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
+    host = loopback()
     async with await asyncio.start_server(talk, host, PORT):
         reader = PrimaryReader(host)
         waiting = asyncio.create_task(reader.first())
@@ -163,6 +163,27 @@ async def test_a_controller_that_is_slow_to_state_its_tool_is_waited_for(
         said.set()
         assert (await waiting).tcp_offset == TOOL
         await reader.close()
+
+
+async def test_a_port_that_is_opened_late_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ur_tool, "RETRY_S", 0.01)
+    made = SimulatedRobot(Settings(), Journal())
+    made.tcp = TOOL
+
+    async def talk(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(state(made, first=True))
+        writer.close()
+
+    host = loopback()
+    reader = PrimaryReader(host)
+    assert (await reader.first()).tcp_offset is None
+    async with await asyncio.start_server(talk, host, PORT):
+        await until(lambda: reader.installation.tcp_offset == TOOL)
+        await reader.close()
+
+
+def loopback() -> str:
+    return f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
 
 
 def state_of(made: SimulatedRobot) -> bytes:

@@ -75,6 +75,8 @@ class Session:
         self._run: asyncio.Task[None] | None = None
         self._stops = 0
         """Number of STOPs: an acknowledgement is not of one that came after it was asked for."""
+        self._ending = False
+        """The daemon ends: nobody gets or keeps control."""
         self._tasks: list[asyncio.Task[None]] = []
         cell.arm.subscribe(monitor.add)
         cell.arm.subscribe(self.context.record_state)
@@ -118,7 +120,7 @@ class Session:
 
     async def close(self) -> None:
         """Stop the arm, finish the recording, then close devices and worker."""
-        context = self.context
+        context, self._ending = self.context, True
         self.approvals.void()
         if self.store.state in RUNNING:
             await self._halt(StationState.STOPPED, "The station is ending.", "station-ending")
@@ -296,6 +298,8 @@ class Session:
 
     def _require_control(self, client_id: int) -> None:
         lease = self.store.status.lease
+        if self._ending:
+            raise RefusedError("station-ending")
         if lease.client_id is None:
             raise RefusedError("no-control")
         if lease.client_id != client_id:

@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import AsyncMock
 
 import msgspec
 import pytest
@@ -79,6 +80,15 @@ async def test_a_dashboard_that_is_gone_is_opened_again(link: Any, dead: Any) ->
     kept = link.dashboard
     await link.supervise_more()
     assert link.dashboard is kept
+
+
+async def test_who_connects_twice_opens_one_link_and_a_closed_one_stays_closed(link: Any) -> None:
+    link._open = AsyncMock()
+    assert await link.connect() == await link.connect()
+    assert link._open.await_count == 1
+    supervisor = link._supervisor
+    await link.close()
+    assert supervisor.cancelled()
 
 
 async def test_a_robot_that_cannot_be_asked_for_is_named(tmp_path: Path) -> None:

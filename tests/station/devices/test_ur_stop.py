@@ -7,15 +7,17 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
 from station.cell.config import RobotConfig
+from station.cell.errors import RobotError
 from station.devices import ur
 from station.devices.rtde import RuntimeState
 from station.devices.ur import UrRobot
 from station.devices.ur_dashboard import STOP
+from tests.codes import raises
 from tests.patience import PATIENCE_S
 
 
@@ -124,6 +126,32 @@ async def test_a_program_that_starts_only_after_its_process_was_killed_is_stoppe
     ways.ended.set()
     await robot.end_control()
     assert ways.log == ["child ends", *([] if ready else ["dashboard anew"])]
+
+
+async def test_so_is_one_that_starts_only_after_a_stop(
+    robot: Any, ways: Ways, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ur, "UPLOADED_S", PATIENCE_S)
+    ways.started_s = 0.0
+    shows(robot, RuntimeState.STOPPED, RuntimeState.PLAYING)
+    ways.reply.set_result("Stopped")
+    await robot.stop("STOP by anna")
+    await robot.idle()
+    assert ways.log[2:] == ["child ends", "dashboard anew"]
+
+
+async def test_control_starts_when_the_last_one_has_ended(
+    robot: Any, ways: Ways, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ur, "ready", looks := AsyncMock(side_effect=RobotError("no-host")))
+    robot._child = None
+    robot._later(ways.end())
+    starting = asyncio.create_task(robot.start_control())
+    await asyncio.sleep(0.01)
+    assert not looks.called
+    ways.ended.set()
+    with raises("no-host"):
+        await starting
 
 
 async def test_an_end_of_control_that_is_cancelled_is_carried_out(robot: Any, ways: Ways) -> None:

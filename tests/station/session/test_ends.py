@@ -207,3 +207,15 @@ async def test_a_call_that_hangs_costs_its_own_answer_only_and_nobody_waits_for_
     workers.close()
     results = await asyncio.gather(*calls, return_exceptions=True)
     assert [type(result) for result in results] == [WorkerError] * 2 and workers._pool is None
+
+
+async def test_nothing_begins_once_the_daemon_ends(rig: Rig) -> None:
+    offer = await rig.session.prepare(1)
+    closing = asyncio.create_task(rig.session.close())
+    await asyncio.sleep(0)
+    with raises("station-ending"):
+        await rig.session.go(1, offer.token)
+    with raises("station-ending"):
+        await rig.session.prepare(1)
+    await closing
+    assert "move" not in rig.arm.log

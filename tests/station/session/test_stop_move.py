@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from unittest.mock import AsyncMock
+
 import msgspec
 import pytest
 
 from station.cell.arm_acceptance import Acceptance, StopWay, write_acceptance
-from station.cell.errors import RefusedError
+from station.cell.errors import RefusedError, RobotError
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, StopTest
@@ -49,6 +51,13 @@ async def test_stop_of_a_person_stays_latched(rig: Rig) -> None:
     assert rig.state is S.STOPPED and rig.arm.log.count("stop") == 1
     with raises("wrong-state", RefusedError):
         await offered(rig)
+
+
+async def test_a_move_that_fails_is_stopped(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig.arm, "move", AsyncMock(side_effect=RobotError("program-ended")))
+    await rig.session.go(1, (await offered(rig)).token)
+    await rig.until(S.IDLE)
+    assert rig.arm.log == ["start control", "stop", "end control"]
 
 
 async def said(rig: Rig) -> bool:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
-import subprocess
-import sys
 from typing import Any
 
 import pytest
@@ -13,6 +10,7 @@ import typer
 
 from recordings.cli.lazy import LazyGroup
 from station.cli.app import STATION
+from tests.command_line import call
 
 
 def resolve(*words: str) -> tuple[str, Any, list[str]]:
@@ -28,13 +26,12 @@ def test_a_line_of_the_table_opens_its_commands_help(name: str) -> None:
 
 
 @pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
-def test_help_fits_on_a_small_terminal_and_all_lists_every_command(program: str) -> None:
-    shown = {}
-    for option in ("--help", "--all"):
-        command = [sys.executable, "-m", f"{program}.cli", option]
-        small = {**os.environ, "COLUMNS": "80"}
-        done = subprocess.run(command, capture_output=True, text=True, check=True, env=small)
-        shown[option] = done.stdout.splitlines()
+def test_help_fits_on_a_small_terminal_and_all_lists_every_command(
+    program: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    main = importlib.import_module(f"{program}.cli").main
+    shown = {option: call(main, option).stdout.splitlines() for option in ("--help", "--all")}
     group: LazyGroup = getattr(importlib.import_module(f"{program}.cli.app"), program.upper())
     common = {name for name, command in group._lazy.items() if not command.rare}
     for option, names in (("--help", common), ("--all", set(group.commands))):

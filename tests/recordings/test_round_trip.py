@@ -76,9 +76,13 @@ def test_every_kind_of_picture_is_lossless(
     image = np.random.default_rng(1).integers(0, np.iinfo(kind).max, shape).astype(kind)[::-1]
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         encoded = encode_png(image) if compressed else None
-        writer.image(Image(image, Stamps(), 0, 0, pixel_format=pixel_format), encoded)
+        writer.image(Image(image, Stamps(1, START_NS), 0, 0, pixel_format=pixel_format), encoded)
         writer.view(make_view(0))
         recording = open_recording(writer.finish())
+        with writer.path.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            ((*_, shown),) = reader.iter_decoded_messages(["/camera/image", "/camera/image/compressed"])
+        assert shown.timestamp.ToNanoseconds() == START_NS
     picture = recording.image(recording.views()[0])
     np.testing.assert_array_equal(picture.pixels, image)
     assert picture.pixels.dtype == kind

@@ -63,7 +63,7 @@ async def test_the_port_must_be_there_and_ours_alone(trigger: SerialTrigger, hel
 async def test_a_pulse_width_the_box_cannot_do_is_refused(box: SimulatedTriggerBox) -> None:
     device = SerialTrigger(TriggerConfig(port=box.port, pulse_us=5))
     await device.open()
-    with raises("trigger-refused"):
+    with raises("trigger-refused", reason="FIRE 5"):
         await device.fire()
     await device.close()
 

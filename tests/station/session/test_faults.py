@@ -30,6 +30,9 @@ async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: R
     await rig.go_until(S.PAUSED)
     assert rig.pose_states == ["failed", "done", "done", "done"]
     assert rig.cause == "poses-failed"
+    recording = rig.session.context.require_recording()
+    shown_s = recording.elapsed_s
+    assert shown_s == recording.elapsed_s, "no time is counted at rest"
     await rig.session.finish(1)
     assert [view.index for view in sealed(rig).views()] == [1, 2, 3]
 

@@ -215,9 +215,8 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
                     if group is not None:
                         seen = group[np.linalg.norm(seen[:, None] - group, axis=2).argmin(axis=1)]
                     ordered = _best_order(seen, spec)
-                    if ordered is None or not _is_even(ordered, spec):
-                        return None
-                    return true_centres(grey, ordered, spec)
+                    if ordered is not None and _is_even(ordered, spec):
+                        return true_centres(grey, ordered, spec)
     return None
 
 

@@ -276,15 +276,17 @@ def test_a_tilted_circle_is_its_own_centre_not_its_ellipses(spec: BoardSpec) -> 
     assert np.sqrt(np.square(misses).mean()) < 0.05
 
 
-def test_a_grid_of_circles_is_found_among_other_dots() -> None:
+def test_a_grid_of_circles_is_found_among_other_dots_and_beside_an_uneven_grid() -> None:
     spec, rng = BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 5, 0.02), np.random.default_rng(0)
     true = board_points(spec)[:, :2] * 1500 + [520, 250]
     image = np.full((720, 1280), 200, np.uint8)
     for at in rng.uniform((430, 180), (850, 500), (100, 2)):
         if not (490 < at[0] < 760 and 235 < at[1] < 395):
             cv2.circle(image, at.astype(int).tolist(), int(rng.uniform(3, 6)), 60, cv2.FILLED, cv2.LINE_AA)
-    for at in true:
-        cv2.circle(image, np.rint(16 * at).astype(int).tolist(), 9 * 16, 40, cv2.FILLED, cv2.LINE_AA, 4)
+    uneven = true / 2 + [680, 150]
+    uneven[7] += 8
+    for at, radius in (*((at, 9) for at in true), *((at, 5) for at in uneven)):
+        cv2.circle(image, np.rint(16 * at).astype(int).tolist(), radius * 16, 40, cv2.FILLED, cv2.LINE_AA, 4)
     found = detect(cv2.GaussianBlur(image, (0, 0), 1), spec)
     assert len(found.pixels) == len(true)
     assert np.abs(found.pixels - true).max() < 0.2

@@ -1,5 +1,5 @@
-"""Procedures with a person: capture, drift check, touch test, acceptance of an arm, a new cell.
+"""Procedures with a person: capture, drift check, touch test, a new cell; and the judge of an arm's stops.
 
-They depend on the daemon's protocol only. Shell and screen each pass in a callable or small object by which
-the person is asked.
+They depend on the daemon's protocol only. Shell and screen each pass in a callable by which the person is
+asked.
 """

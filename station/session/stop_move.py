@@ -1,6 +1,6 @@
 """Move of the acceptance test: one joint turns, slowly, and is stopped half way in one way.
 
-Nothing is recorded here: the stop is judged from another connection to the arm (`operate.stop_test`).
+Nothing is recorded here: the stop is judged from another connection to the arm (`cli.accept`).
 """
 
 from __future__ import annotations

@@ -15,36 +15,34 @@ from station.cell.arm_acceptance import Acceptance, StopWay, read_acceptance
 from station.cell.errors import RefusedError
 from station.cell.status import StationState as S
 from station.devices.ur_state import TraceRecorder
-from station.operate.stop_test import AcceptanceTest
 from station.protocol.client import Client
 from station.protocol.verbs import Stop
 from station.simulation.launch import SimulatedController
 from station.simulation.truth import write_truth
 from tests.codes import raises
-from tests.station.operate.test_stop_test import Hands
+from tests.station.cli.test_accept import Hands
 from tests.system.conftest import AT_REST_RAD_S, TRUTH, SystemRig, both_paths, status_when
 
 pytestmark = pytest.mark.process
 SLOW_M_S = 0.05
 
 
-async def begun(rig: SystemRig, *ways: StopWay, holds: bool = True) -> tuple[Client, Hands, AcceptanceTest]:
+async def begun(rig: SystemRig, *ways: StopWay) -> tuple[Client, Hands]:
     daemon = await rig.daemon()
     client = await daemon.client()
     await status_when(client, lambda s: s.state is S.IDLE)
-    hands, recorder = Hands(holds), TraceRecorder(rig.controller.host)
-    return client, hands, AcceptanceTest(client, hands, recorder, SLOW_M_S, 0, ways)
+    return client, Hands(client, TraceRecorder(rig.controller.host), SLOW_M_S, ways)
 
 
 async def test_a_sound_arm_passes_and_every_move_was_approved_by_itself(rig: SystemRig) -> None:
     ways = (StopWay.CONTROL, StopWay.FROZEN)
-    client, tester, test = await begun(rig, *ways)
+    client, test = await begun(rig, *ways)
     found: Acceptance = await test.run()
     await client.close()
     assert [result.way for result in test.results] == list(ways)
     assert all(result.passed for result in test.results), test.results
-    assert len({preview.token for preview in tester.approved}) == len(tester.approved) >= len(ways)
-    assert all(preview.top_speed_m_s <= SLOW_M_S for preview in tester.approved)
+    assert len({preview.token for preview in test.approved}) == len(test.approved) >= len(ways)
+    assert all(preview.top_speed_m_s <= SLOW_M_S for preview in test.approved)
     assert not found.accepted, "some ways only were tested"
     assert found.speed_m_s == 0 and found.subject.source == "simulated"
 
@@ -61,7 +59,7 @@ async def test_a_stop_that_is_ignored_ends_the_test_and_the_arm_is_stopped_all_t
     )
     rig = SystemRig(deaf, short_folder, tmp_path)
     try:
-        client, _, test = await begun(rig, StopWay.CONTROL, StopWay.DASHBOARD)
+        client, test = await begun(rig, StopWay.CONTROL, StopWay.DASHBOARD)
         found = await test.run()
         await client.close()
         assert [result.way for result in test.results] == [StopWay.CONTROL]
@@ -74,10 +72,11 @@ async def test_a_stop_that_is_ignored_ends_the_test_and_the_arm_is_stopped_all_t
 
 
 async def test_nothing_moves_without_emergency_stop_full_slider_and_acknowledged_stop(rig: SystemRig) -> None:
-    client, hands, test = await begun(rig, StopWay.CONTROL, holds=False)
+    client, test = await begun(rig, StopWay.CONTROL)
+    test.holds = False
     with raises("no-emergency-stop", RefusedError):
         await test.run()
-    hands.holds = True
+    test.holds = True
     rig.admin.ask("slider", fraction=0.5)
     await status_when(client, lambda s: s.robot.state and s.robot.state.target_speed_fraction < 0.6)
     with raises("slider-low", RefusedError):
@@ -87,7 +86,7 @@ async def test_nothing_moves_without_emergency_stop_full_slider_and_acknowledged
     await client.call(Stop())
     with raises("wrong-state", RefusedError):
         await test.run()
-    assert not hands.approved
+    assert not test.approved
     await client.close()
 
 

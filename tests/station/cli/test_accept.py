@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,8 +13,8 @@ import pytest
 from recordings.schema.messages import RobotState
 from station.cell.arm_acceptance import STOP_GIVEN, ArmSubject, Figure, StopResult, StopTestMove, StopWay
 from station.cell.status import Event, MotionPreview, StationState, StationStatus
-from station.operate import stop_test
-from station.operate.stop_test import TRIES, AcceptanceTest
+from station.cli import accept
+from station.cli.accept import TRIES, AcceptanceTest
 from station.protocol.verbs import Go, StopTest, Verb
 
 SUBJECT = ArmSubject("real", "UR10e", "1", "5.11", (), "ur_rtde")
@@ -47,16 +48,18 @@ class Daemon:
         yield StationStatus(state=StationState.IDLE, events=(given,) if self.went > self.ungiven else ())
 
 
-class Hands:
-    """A person who approves, and is told."""
+class Hands(AcceptanceTest):
+    """The test of a person who approves, and is told."""
 
-    def __init__(self, holds: bool = True) -> None:
-        self.holds = holds
+    holds, says_no_after = True, 1000
+
+    def __init__(self, client: Any, recorder: Any, speed_m_s: float, ways: Sequence[StopWay]) -> None:
+        shell: Any = SimpleNamespace(client=client, approves=self.approves)
+        super().__init__(shell, recorder, speed_m_s, ways=ways)
         self.approved: list[MotionPreview] = []
         self.told: list[StopResult] = []
-        self.says_no_after = 1000
 
-    async def holds_emergency_stop(self) -> bool:
+    def holds_emergency_stop(self) -> bool:
         return self.holds
 
     async def approves(self, preview: MotionPreview) -> bool:
@@ -85,43 +88,41 @@ def bad(monkeypatch: pytest.MonkeyPatch) -> set[StopWay]:
         figure = Figure("rest", 2.0 if move.way in found else 0.0, "s", 1.0, "")
         return ((), "too early") if moment_ns is None else ((figure,), "")
 
-    monkeypatch.setattr(stop_test, "AFTER_S", 0.0)
-    monkeypatch.setattr(stop_test, "judge", judge)
+    monkeypatch.setattr(accept, "AFTER_S", 0.0)
+    monkeypatch.setattr(accept, "judge", judge)
     return found
 
 
-def begun(
-    ungiven: int = 0, ways: tuple[StopWay, ...] = tuple(StopWay)
-) -> tuple[Daemon, Hands, AcceptanceTest]:
-    daemon, hands = Daemon(ungiven), Hands()
-    return daemon, hands, AcceptanceTest(daemon, hands, Nothing(), 0.1, ways=ways)
+def begun(ungiven: int = 0, ways: tuple[StopWay, ...] = tuple(StopWay)) -> tuple[Daemon, Hands]:
+    daemon = Daemon(ungiven)
+    return daemon, Hands(daemon, Nothing(), 0.1, ways)
 
 
 async def test_every_way_has_its_own_approval_and_it_is_accepted_up_to_the_chosen_speed() -> None:
-    daemon, hands, test = begun()
+    daemon, test = begun()
     found = await test.run()
     assert found.accepted and found.speed_m_s == 0.1
     assert [(verb.way, verb.speed_m_s) for verb in daemon.asked] == [(way, 0.1) for way in StopWay]
-    assert len({preview.token for preview in hands.approved}) == daemon.went == len(StopWay)
+    assert len({preview.token for preview in test.approved}) == daemon.went == len(StopWay)
 
 
 async def test_it_is_accepted_up_to_the_speed_that_was_reached() -> None:
     """A wrist at its largest joint speed is slow: nobody saw how the arm stops at what was wanted."""
-    daemon, _, test = begun()
+    daemon, test = begun()
     daemon.fastest_m_s = 0.06
     found = await test.run()
     assert found.accepted and found.speed_m_s == 0.06
 
 
 async def test_part_of_the_ways_accepts_nothing() -> None:
-    _, _, test = begun(ways=(StopWay.CONTROL, StopWay.FROZEN))
+    _, test = begun(ways=(StopWay.CONTROL, StopWay.FROZEN))
     found = await test.run()
     assert not found.accepted and found.speed_m_s == 0 and all(result.passed for result in found.results)
 
 
 async def test_a_figure_beyond_its_limit_ends_it_and_what_passed_before_is_kept(bad: set[StopWay]) -> None:
     bad.add(StopWay.DASHBOARD)
-    daemon, _, test = begun()
+    daemon, test = begun()
     found = await test.run()
     assert not found.accepted and daemon.went == 2
     assert [(result.way, result.passed) for result in found.results] == [
@@ -131,21 +132,21 @@ async def test_a_figure_beyond_its_limit_ends_it_and_what_passed_before_is_kept(
 
 
 async def test_a_no_ends_it_and_nothing_more_moves() -> None:
-    daemon, hands, test = begun()
-    hands.says_no_after = 2
+    daemon, test = begun()
+    test.says_no_after = 2
     found = await test.run()
     assert not found.accepted and daemon.went == 2 and len(found.results) == 2
 
 
 async def test_a_move_that_was_not_measured_is_asked_for_again() -> None:
-    daemon, hands, test = begun(ungiven=1)
+    daemon, test = begun(ungiven=1)
     found = await test.run()
     assert found.accepted and len(found.results) == 4
-    assert daemon.went == len(hands.told) == 5 and hands.told[0].not_measured
+    assert daemon.went == len(test.told) == 5 and test.told[0].not_measured
 
 
 async def test_what_could_not_be_measured_is_told_as_that_and_the_other_ways_are_tried() -> None:
-    daemon, _, test = begun(ungiven=TRIES)
+    daemon, test = begun(ungiven=TRIES)
     found = await test.run()
     assert not found.accepted and not any(result.failed for result in found.results)
     assert [bool(result.not_measured) for result in found.results] == [True, False, False, False]

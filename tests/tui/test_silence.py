@@ -34,7 +34,6 @@ async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_ol
         await pilot.pause()
         assert "MOVING" not in text_of(pilot.app, "#bar")
         assert "EMERGENCY STOP" in text_of(pilot.app, "#next")
-        assert "EMERGENCY STOP" in text_of(pilot.app, "#next")
         assert str(pilot.app.screen.query_one("#progress").border_title).endswith(": OLD")
         assert OLD in preview.render_line(preview.size.height // 2).text
         await pilot.press("2")  # every screen says it

@@ -24,13 +24,14 @@ STANDING = RobotStatus(state=make_state(0))
 class Telling:
     """A daemon's client as far as it is needed here."""
 
-    def __init__(self, *told: StationStatus) -> None:
-        self._told = told
+    def __init__(self, *told: StationStatus, ends: bool = False) -> None:
+        self._told, self._ends = told, ends
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
         for status in self._told:
             yield status
-        await asyncio.Event().wait()
+        if not self._ends:
+            await asyncio.Event().wait()
 
 
 def waited(*told: StationStatus) -> StationStatus:

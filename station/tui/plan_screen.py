@@ -88,19 +88,21 @@ class PlanScreen(StationScreen):
 
     def on_data_table_row_selected(self) -> None:
         """Tell all of a pose, of which the table may show the beginning."""
+        if (pose := self._chosen()) is not None:
+            told = ". ".join(words for words in (pose.name, pose.why, pose.reason) if words)
+            self.notify(told, timeout=10, markup=False)
+
+    def _chosen(self) -> PoseStatus | None:
+        """The pose at the cursor; None: a shorter plan came and is not drawn yet."""
         row, poses = self.table.cursor_row, self.known.shown.session.poses
-        if row >= len(poses):
-            return  # a shorter plan came
-        pose = poses[row]
-        told = ". ".join(words for words in (pose.name, pose.why, pose.reason) if words)
-        self.notify(told, timeout=10, markup=False)
+        return poses[row] if row < len(poses) else None
 
     def action_pose(self, verb: str) -> None:
         status = self.known.live
         if status is None or not status.session.poses:
             self.notify("No plan is loaded: n makes one, or `station plan` in a shell.", severity="warning")
-        else:
-            self.ask(POSE_VERBS[verb](status.session.poses[self.table.cursor_row].index))
+        elif (pose := self._chosen()) is not None:
+            self.ask(POSE_VERBS[verb](pose.index))
 
     def action_make(self) -> None:
         self.ask(NEW_PLAN, PREPARE_S)

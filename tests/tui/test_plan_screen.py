@@ -43,3 +43,17 @@ async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> No
         await until(pilot, lambda: table.row_count == 25 and str(table.get_row_at(7)[-1]) == "too dark")
         assert str(table.get_row_at(7)[-2]) == "failed", "a long reason pushes no column out of sight"
         assert [str(table.get_row_at(row)[0])[-1] for row in (6, 7)] == ["○", "✗"]  # never cut away
+
+
+async def test_a_key_between_a_shorter_plan_and_its_drawing_asks_nothing(link: FakeLink) -> None:
+    status = idle()
+    async with opened(link) as pilot:
+        await pilot.press("2", "end")
+        await until(pilot, lambda: pilot.app.screen.query_one(DataTable).cursor_row == 24)
+        pilot.app.hear(in_session(status, poses=status.session.poses[:8]))
+        pilot.app.screen.action_pose("retake")
+        pilot.app.screen.on_data_table_row_selected()
+        await pilot.pause()
+        await pilot.press("r")
+        await until(pilot, lambda: link.verbs)
+        assert link.asked[-1] == verbs.Retake(7) and len(link.verbs) == 1

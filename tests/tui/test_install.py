@@ -60,6 +60,8 @@ def test_there_is_one_verdict_in_three_states(result: Result, verdict: str) -> N
     if result.calibration is not None:
         assert verdict_lines(result).plain.split(", ")[0][2:] == verdict
         assert f"Session {GOOD.provenance.session}" in verdict_lines(result).plain
+    else:
+        assert verdict_lines(result).plain == result.problem
 
 
 def test_terminal_and_screen_say_the_same_figures() -> None:

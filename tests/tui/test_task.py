@@ -105,6 +105,7 @@ def test_the_bar_fits_and_keeps_state_and_simulated_first(
     line = bar_line(Known(status), "Capture", width).plain
     assert len(line) <= width
     assert line.startswith(" Capture ")
+    assert ("▲ NO ROBOT" in line) == (state is StationState.DISCONNECTED)
     assert "SIMULATED" in line
 
 

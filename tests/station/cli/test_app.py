@@ -19,7 +19,7 @@ import typer
 
 from recordings.errors import CodedError, ErrorReport
 from station.cell.errors import StationError
-from station.cell.status import MotionPreview, PoseStatus, SessionStatus, StationStatus
+from station.cell.status import MotionPreview, PoseStatus, SessionStatus, StationState, StationStatus
 from station.cli import daemon, main, session
 from station.cli.app import STATION
 from station.cli.daemon import ensure_daemon, own_daemon, tell_what_goes_on
@@ -28,6 +28,7 @@ from station.protocol.states import RUNNING
 from tests.codes import raises
 from tests.command_line import call
 from tests.patience import PATIENCE_S, wait_until
+from tests.tui.conftest import FakeLink, idle, in_session
 
 pytestmark = pytest.mark.process
 
@@ -119,6 +120,14 @@ def test_a_session_with_loss_names_what_is_missing_and_ends_with_3(
         session._finish(StationStatus(session=SessionStatus(poses=poses, captured=1, recording="/r")), False)
     said = capsys.readouterr().out
     assert end.value.exit_code == 3 and f"pose 2. {missed.reason}" in said and "calibrate solve /r" in said
+
+
+@pytest.mark.parametrize("headless", [True, False])
+async def test_a_paused_session_is_finished_with_loss_only_where_nobody_attends(headless: bool) -> None:
+    link, paused = FakeLink(), in_session(idle(StationState.PAUSED), captured=1)
+    link.show(paused)
+    await session.Attended(Path(), link, True, headless, "", True).watch(True, paused)
+    assert link.verbs == ["finish"] * headless
 
 
 async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:

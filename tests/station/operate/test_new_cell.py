@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.boards.model import typed_board
+from calibrate.boards.model import board_points, typed_board
 from calibrate.geometry import difference, inverse
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardKind, BoardSpec, Image, Mount, RobotIdentity, Stamps
@@ -83,7 +83,17 @@ def test_what_was_written_is_read_back_and_can_be_planned(
     config, content = load_config(path)
     assert config == made
     assert content.count(b"#") >= 6
-    group, _ = candidate_pool(layout_of(config), PlanOptions(pool=200), None, np.random.default_rng(0))
+    layout, limits = layout_of(config), config.limits
+    flanges = np.array([view.base_from_flange for view in draft.views])
+    away_m = np.linalg.norm(layout.seen(flanges[:1], board_points(draft.board).mean(axis=0)[None]))
+    assert config.working_distance_m == pytest.approx(away_m, abs=0.005)
+    cameras = flanges @ layout.X if draft.mount == "eye-in-hand" else flanges
+    at = np.concatenate([flanges, cameras])[:, :3, 3]
+    room_m = np.array(
+        [(at.min(axis=0) - limits.workspace_min_m)[:2], (limits.workspace_max_m - at.max(axis=0))[:2]]
+    )
+    assert room_m.min() > flow._ROOM_M - 0.002, "around the camera, too"
+    group, _ = candidate_pool(layout, PlanOptions(pool=200), None, np.random.default_rng(0))
     assert len(group) >= 75
     with disk_order(monkeypatch) as order:
         flow.write_config(draft, path)

@@ -1,8 +1,7 @@
-"""A small terminal: a pty, a program in it, and what stands on its glass. No colours, no scrolling."""
+"""A terminal: a pty, a program in it, and what stands on its glass."""
 
 from __future__ import annotations
 
-import codecs
 import contextlib
 import fcntl
 import os
@@ -17,6 +16,8 @@ import time
 from collections import deque
 from pathlib import Path
 
+import pyte
+
 from tests.patience import PATIENCE_S
 
 KEYS = {
@@ -30,54 +31,24 @@ KEYS = {
     "enter": "\r",
     "ctrl+q": "\x11",
 }
-_TOKEN = re.compile(
-    r"\x1b\[([0-9;?<>=]*)([A-Za-z~])|\x1b[P\]].*?(?:\x1b\\|\x07)|\x1b.|[\x00-\x1f]|[^\x00-\x1f\x1b]+"
-)
-_UNFINISHED = re.compile(r"\x1b(?:\[[0-9;?<>=]*|[P\]][^\x07]*)?$")
 
 
 class Glass:
-    """The text on a terminal that suffices for a program that places every line itself."""
+    """The text on a terminal, told from what a program wrote when somebody looks: it never waits."""
 
     def __init__(self, columns: int, rows: int) -> None:
-        self._columns = columns
-        self._cells = [[" "] * columns for _ in range(rows)]
-        self._row = self._column = 0
-        self._rest = ""
-        self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
+        self._screen = pyte.Screen(columns, rows)
+        self._stream = pyte.ByteStream(self._screen)
         self._unread: deque[bytes] = deque()
 
     def write(self, data: bytes) -> None:
-        """Kept as it is until somebody looks: a program must not wait for its terminal."""
         self._unread.append(data)
-
-    def _read(self, data: bytes) -> None:
-        text = self._rest + self._decoder.decode(data)
-        unfinished = _UNFINISHED.search(text)
-        self._rest = text[unfinished.start() :] if unfinished else ""
-        for token in _TOKEN.finditer(text[: len(text) - len(self._rest)]):
-            self._take(token)
-
-    def _take(self, token: re.Match[str]) -> None:
-        whole = token.group()
-        if token.group(2) == "H":
-            row, column = ([*map(int, filter(None, token.group(1).split(";"))), 1, 1])[:2]
-            self._row, self._column = row - 1, column - 1
-        elif whole == "\n":
-            self._row += 1
-        elif whole == "\r":
-            self._column = 0
-        elif whole >= " ":
-            for character in whole:
-                if self._row < len(self._cells) and self._column < self._columns:
-                    self._cells[self._row][self._column] = character
-                self._column += 1
 
     @property
     def text(self) -> str:
         while self._unread:
-            self._read(self._unread.popleft())
-        return "\n".join("".join(row).rstrip() for row in self._cells)
+            self._stream.feed(self._unread.popleft())
+        return "\n".join(line.rstrip() for line in self._screen.display)
 
 
 class ScreenProcess:

@@ -56,4 +56,4 @@ async def test_a_key_between_a_shorter_plan_and_its_drawing_asks_nothing(link: F
         await pilot.pause()
         await pilot.press("r")
         await until(pilot, lambda: link.verbs)
-        assert link.asked[-1] == verbs.Retake(7) and len(link.verbs) == 1
+        assert link.verbs == ["retake"] and verbs.Retake(7) in link.asked

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import getpass
-import subprocess
-import sys
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, asynccontextmanager
@@ -20,6 +18,7 @@ from recordings.reader import open_recording
 from station.cell.config import ApprovalConfig, StationConfig
 from station.cell.pose_plan import Plan
 from station.cell.status import MotionPreview, StationState, StationStatus
+from station.cli.daemon import own_daemon
 from station.operate.motion import prepared_motion, until_rest, wait_until_idle
 from station.plan.planner import make_plan
 from station.protocol.client import Client
@@ -30,7 +29,7 @@ from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.truth import write_truth
 from tests.foreign.test_gige_vision import loss
 from tests.gige_vision.camera import EmulatedCamera, Picture
-from tests.system.conftest import AT_REST_RAD_S, status_when
+from tests.system.conftest import SystemRig, status_when
 
 pytestmark = [pytest.mark.gige, pytest.mark.process]
 TRUTH = make_cell(seed=5)
@@ -60,21 +59,11 @@ def configuration(arm: SimulatedController) -> StationConfig:
 async def served(config: StationConfig, folder: Path) -> AsyncIterator[Client]:
     """`station serve --config`, and a client that has control."""
     (folder / "station.yaml").write_bytes(msgspec.yaml.encode(config))
-    socket = folder / "control.sock"
-    command = [sys.executable, "-m", "station.cli", "serve", "--config", str(folder / "station.yaml")]
-    with subprocess.Popen(
-        [*command, "--socket", str(socket), "--root", str(folder)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-    ) as daemon:
-        try:
-            assert await asyncio.to_thread(daemon.stdout.readline), "it did not start"
-            async with Client(socket) as client:
-                await wait_until_idle(client)
-                yield client
-        finally:
-            daemon.terminate()
-            daemon.wait(20)
+    arguments = ["--config", str(folder / "station.yaml"), "--root", str(folder)]
+    with own_daemon(arguments, folder / "daemon.log") as socket:
+        async with Client(socket) as client:
+            await wait_until_idle(client)
+            yield client
 
 
 async def checked(client: Client) -> dict[str, Check]:
@@ -96,24 +85,6 @@ async def captured(client: Client, plan: Plan) -> StationStatus:
     await client.call(LoadPlan(plan))
     assert await prepared_motion(client, Prepare(), yes)
     return await until_rest(client, lambda status: None)
-
-
-async def stopped_in_mid_move(client: Client, plan: Plan, arm: SimulatedController) -> StationStatus:
-    """STOP at full speed; the arm's own account says that it rests."""
-    await client.call(LoadPlan(plan))
-    with arm.admin() as admin:
-
-        def speed_rad_s() -> float:
-            return float(max(map(abs, admin.ask("state")["joint_speeds_rad_s"])))
-
-        assert await prepared_motion(client, Prepare(), yes)
-        async with asyncio.timeout(30):
-            while speed_rad_s() < 0.1:
-                await asyncio.sleep(0.005)
-            await client.call(Stop())
-            while speed_rad_s() > AT_REST_RAD_S:
-                await asyncio.sleep(0.005)
-    return await status_when(client, lambda status: status.state is StationState.STOPPED)
 
 
 def planned(config: StationConfig, poses: int) -> Plan:
@@ -154,4 +125,12 @@ async def test_a_session_with_the_emulated_camera(
             assert (await checked(client))["camera"].state == "failed"
             power.enter_context(EmulatedCamera(picture=seen))
             await good(client, "camera")
-            assert (await stopped_in_mid_move(client, plan, arm)).camera.connected
+            await client.call(LoadPlan(plan))
+            assert await prepared_motion(client, Prepare(), yes)
+            rig = SystemRig(arm, tmp_path, tmp_path)
+            await rig.moving()
+            await client.call(Stop())
+            await rig.stops()
+            rig.end()
+            stopped = await status_when(client, lambda status: status.state is StationState.STOPPED)
+            assert stopped.camera.connected

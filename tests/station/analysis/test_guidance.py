@@ -7,13 +7,13 @@ import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
-from calibrate.projection import project_pixels
 from calibrate.views import implied_flange
 from recordings.schema.messages import CameraModel, Mount
 from station.analysis.guidance import NextView, next_view, rim, way_to
 from station.analysis.worker import CapturedView
 from station.cell.status import FEWEST_BY_HAND
 from station.simulation.cells import make_cell
+from tests.station.true_camera import corners_seen
 
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 TRUTH = make_cell("paper", seed=3, noise="mid")
@@ -24,10 +24,8 @@ STRAIGHT = pose(np.eye(3), np.array([0.0, 0.0, 0.5]) - MIDDLE)
 
 
 def seen(C: Array, index: int = 0, flange: Array | None = None) -> CapturedView:
-    points = board_points(BOARD)
-    noise = np.random.default_rng(index).normal(0, 0.1, (len(points), 2))
-    pixels = project_pixels(LENS, transform_points(C, points)) + noise
-    return CapturedView(index, np.eye(4) if flange is None else flange, np.arange(len(points)), pixels)
+    pixels = corners_seen(TRUTH, C, np.random.default_rng(index))
+    return CapturedView(index, np.eye(4) if flange is None else flange, np.arange(len(pixels)), pixels)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -11,8 +11,6 @@ import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
-from calibrate.projection import project_pixels
-from calibrate.views import board_in_camera
 from recordings.schema.messages import Mount
 from station.analysis.estimation import running_estimate
 from station.analysis.found_cell import FEWEST, find_cell, odd_view
@@ -20,8 +18,9 @@ from station.analysis.worker import CapturedView
 from station.simulation.cells import cell_config, make_cell
 from station.simulation.truth import CellTruth
 from tests.station.quick_plan import quick_plan
+from tests.station.true_camera import board_seen, corners_seen
 
-POSE_NOISE, PIXEL_NOISE = 1e-4, 0.1
+POSE_NOISE = 1e-4
 
 
 def w_first(T: Array) -> Array:
@@ -38,18 +37,15 @@ def views_of(truth: CellTruth, count: int, pose_noise: float = POSE_NOISE) -> li
     """Of an arm with this noise, m and rad."""
     places = quick_plan(cell_config(truth), truth, seed=3, count=count).poses
     flanges = [np.array(place.base_from_flange) for place in places]
-    points, rng = board_points(truth.board), np.random.default_rng(2)
-    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
-    boards = [board_in_camera(truth.mount, flange, X, Y) for flange in flanges]
+    rng, corners = np.random.default_rng(2), np.arange(len(board_points(truth.board)))
     return [
         CapturedView(
             index,
             perturb(flange, rng.normal(0, pose_noise, 6)),
-            np.arange(len(points)),
-            project_pixels(truth.camera, transform_points(board, points))
-            + rng.normal(0, PIXEL_NOISE, (len(points), 2)),
+            corners,
+            corners_seen(truth, board_seen(truth, flange), rng),
         )
-        for index, (flange, board) in enumerate(zip(flanges, boards, strict=True))
+        for index, flange in enumerate(flanges)
     ]
 
 

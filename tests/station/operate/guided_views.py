@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
+from calibrate.geometry import Array, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
-from calibrate.projection import project
+from calibrate.views import implied_flange
 from recordings.schema.messages import RobotIdentity
 from station.analysis.worker import CapturedView
 from station.cell.config import CameraChoice
 from station.operate.draft import Draft
 from station.simulation.truth import CellTruth
 from tests.calibrate.cells import inverse_nearest
+from tests.station.true_camera import board_seen, corners_seen
 
 NEARER_M = (0.0, 0.02, -0.05, 0.06, 0.0)
 TILTS = ((0.0, 0.0, 0.0), (0.45, 0.0, 0.1), (-0.2, 0.45, 0.0), (-0.3, -0.35, 0.3), (0.2, -0.4, -0.6))
@@ -24,16 +25,14 @@ def guided_joints(truth: CellTruth) -> list[Array]:
     model = MODELS[truth.robot_model]
     X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
     start = np.array(truth.start_joints_rad)
-    flange = forward(model, start)
-    in_hand = truth.mount == "eye-in-hand"
-    first = inverse(flange @ X) @ Y if in_hand else inverse(X) @ flange @ Y
+    first = board_seen(truth, forward(model, start))
     middle = transform_points(first, board_points(truth.board).mean(axis=0))
     found: list[Array] = []
     for tilt, nearer_m in zip(TILTS, NEARER_M, strict=True):
         R = rotation_exp(np.array(tilt))
         away = middle * (1 + nearer_m / middle[2])
         seen = pose(R, away - R @ middle) @ first
-        wanted = Y @ inverse(X @ seen) if in_hand else X @ seen @ inverse(Y)
+        wanted = implied_flange(truth.mount, X, Y, seen)
         joints = inverse_nearest(model, wanted, found[-1] if found else start)
         if joints is not None:
             found.append(np.asarray(joints))
@@ -42,13 +41,9 @@ def guided_joints(truth: CellTruth) -> list[Array]:
 
 def seen_by_hand(truth: CellTruth, joints: Array, index: int) -> CapturedView:
     """Give what the true camera sees from there, with noise of 0.1 px."""
-    rng = np.random.default_rng(index)
     flange = forward(MODELS[truth.robot_model], joints)
-    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
-    seen = inverse(flange @ X) @ Y if truth.mount == "eye-in-hand" else inverse(X) @ flange @ Y
-    points = board_points(truth.board)
-    pixels = project(truth.camera, transform_points(seen, points)).pixels
-    return CapturedView(index, flange, np.arange(len(points)), pixels + rng.normal(0, 0.1, pixels.shape))
+    pixels = corners_seen(truth, board_seen(truth, flange), np.random.default_rng(index))
+    return CapturedView(index, flange, np.arange(len(pixels)), pixels)
 
 
 def draft_of(truth: CellTruth, views: int = 4) -> Draft:

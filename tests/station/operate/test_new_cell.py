@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points, typed_board
-from calibrate.geometry import difference, inverse
+from calibrate.geometry import difference
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardKind, BoardSpec, Image, Mount, RobotIdentity, Stamps
 from station.analysis.worker import sight
@@ -31,6 +31,7 @@ from station.simulation.renderer import Light, render
 from tests.codes import raises
 from tests.durability import disk_order
 from tests.station.operate.guided_views import draft_of
+from tests.station.true_camera import board_seen
 
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 
@@ -242,7 +243,7 @@ OTHER = BoardSpec(kind=BoardKind.CHESSBOARD, columns=9, rows=6, square_m=0.025)
 )
 def test_a_fault_of_the_picture_is_named(fault: str, causes: set[str]) -> None:
     flange = forward(MODELS[PICTURED.robot_model], np.array(PICTURED.start_joints_rad))
-    seen = inverse(flange @ np.array(PICTURED.camera_mount)) @ np.array(PICTURED.board_place)
+    seen = board_seen(PICTURED, flange)
     if fault == "board not in view":
         seen[0, 3] += 2.0
     exposure_us = {"over-exposed": 60_000.0, "under-exposed": 1_500.0}.get(fault)

@@ -13,7 +13,6 @@ import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import (
-    inverse,
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotation_angle,
@@ -30,6 +29,7 @@ from station.plan.planner import PlanOptions, make_plan, plan_layout
 from station.plan.visibility import ViewRange, lens_radius, view_range, visible
 from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
+from tests.station.true_camera import board_seen
 
 CELLS = [
     ("paper", "eye-in-hand", 0),
@@ -69,11 +69,10 @@ def test_25_poses_pass_the_check_and_fit_into_a_minute(which):
 def test_the_true_camera_sees_the_whole_board_from_every_pose(which):
     """By OpenCV's projection of the truth, which the planner never saw."""
     truth, _ = cell(*which)
-    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
     points = board_points(truth.board)
     for pose in planned(*which).poses:
         E = forward(MODELS["UR10"], pose.joints_rad)
-        C = inverse(E @ X) @ Y if truth.mount == "eye-in-hand" else inverse(X) @ E @ Y
+        C = board_seen(truth, E)
         K, D = np.array(truth.camera.matrix), np.array(truth.camera.distortion or (0.0,) * 5)
         pixels = cv2.projectPoints(points, cv2.Rodrigues(C[:3, :3])[0], C[:3, 3], K, D)[0].reshape(-1, 2)
         assert (C[:3, :3] @ points.T + C[:3, 3:])[2].min() > 0.1

@@ -10,10 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibrate.boards.model import board_points
-from calibrate.geometry import inverse, transform_points
 from calibrate.kinematics import MODELS, forward
-from calibrate.projection import project
 from recordings.reader import open_recording
 from station.analysis.estimation import seen_before
 from station.analysis.worker import BoardDetection, sight
@@ -24,6 +21,7 @@ from tests.durability import full
 from tests.patience import until
 from tests.station.quick_plan import quick_plan
 from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, crash, memory_config, sealed
+from tests.station.true_camera import board_seen, corners_seen
 
 POSES, BEFORE = 12, 7
 
@@ -41,13 +39,10 @@ class WorkerThatSees(WorkerInThisProcess):
         if function is not sight:
             return await super().call(function, *args, timeout_s=timeout_s, **named)
         flange = forward(MODELS["UR10"], self.rig.arm.joints)
-        board = inverse(flange @ np.array(TRUTH.camera_mount)) @ np.array(TRUTH.board_place)
-        points = board_points(TRUTH.board)
-        pixels = project(TRUTH.camera, transform_points(board, points)).pixels
-        pixels += self.noise.normal(0, 0.1, pixels.shape)
+        pixels = corners_seen(TRUTH, board_seen(TRUTH, flange), self.noise)
         scale = args[0].shape[1] / TRUTH.camera.width  # glimpses are smaller
         seen = np.sort(
-            self.noise.permutation(len(points))[int(scale < 1) :]
+            self.noise.permutation(len(pixels))[int(scale < 1) :]
         )  # each glimpse lacks another corner
         return BoardDetection(self.sees.status, seen, (pixels[seen] + 0.5) * scale - 0.5)
 

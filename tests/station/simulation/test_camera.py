@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from calibrate.boards.detect import detect
-from calibrate.geometry import inverse
 from recordings.schema.messages import Image
 from station.simulation.camera import RenderedCamera
 from station.simulation.cells import make_cell
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
 from tests.codes import raises
+from tests.station.true_camera import board_seen
 
 pytestmark = pytest.mark.process
 
@@ -56,7 +56,7 @@ async def test_pictures_show_the_board_from_the_true_pose_at_mid_exposure(
     assert 0 < bound_s < 0.02
     with AdminClient(arm.host) as admin:
         flange = np.array(admin.ask("truth", at_monotonic_ns=middle_ns)["base_from_flange"])
-    view = inverse(flange @ np.array(cell.camera_mount)) @ np.array(cell.board_place)
+    view = board_seen(cell, flange)
     seen = detect(picture.pixels, cell.board)
     assert seen.found, seen.reason
     ray = view[:3, 3]

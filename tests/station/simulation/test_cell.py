@@ -8,17 +8,12 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import inverse, is_rigid, transform_points
+from calibrate.geometry import is_rigid, transform_points
 from calibrate.kinematics import MODELS, forward
 from station.cell.config import PAPER_BOARD
 from station.simulation.cells import board_centre, cell_config, make_cell
-from station.simulation.truth import CellTruth, read_truth, write_truth
-
-
-def camera_from_board(cell: CellTruth, joints_rad: object) -> np.ndarray:
-    flange = forward(MODELS[cell.robot_model], joints_rad)
-    X, Y = np.array(cell.camera_mount), np.array(cell.board_place)
-    return inverse(flange @ X) @ Y if cell.mount == "eye-in-hand" else inverse(X) @ flange @ Y
+from station.simulation.truth import read_truth, write_truth
+from tests.station.true_camera import board_seen
 
 
 def test_the_papers_scene_is_the_default() -> None:
@@ -38,7 +33,7 @@ def test_the_papers_scene_is_the_default() -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None:
     cell = make_cell(seed=seed, mount=mount)
-    view = camera_from_board(cell, cell.start_joints_rad)
+    view = board_seen(cell, forward(MODELS[cell.robot_model], cell.start_joints_rad))
     centre = transform_points(view, board_centre(cell.board))
     assert 0.4 < centre[2] < 0.65 and np.hypot(*centre[:2]) < 0.05
     assert view[2, 2] > 0.85, "its front, not too slanted"

@@ -39,7 +39,8 @@ class StationState(StrEnum):
     FREE_DRIVE = "free-drive"
 
 
-PoseState = Literal["planned", "moving", "settling", "capturing", "writing", "done", "skipped", "failed"]
+PoseState = Literal["planned", "done", "skipped", "failed"]
+"""State of a pose; what is done at the one under way, `current`, is the station's state."""
 
 
 class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -17,7 +17,7 @@ from station.analysis.worker import BoardDetection, CapturedView, board_box, ima
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.layout import flange_pose
-from station.cell.status import PoseState, StationState
+from station.cell.status import StationState
 from station.devices.news import RESTING_S
 from station.session.context import SessionContext
 from station.session.recording import to_the_end
@@ -44,10 +44,10 @@ async def take_pose(context: SessionContext, index: int, attempt: int, unchecked
 
     PoseFailedError and NotStillError when the pose failed; RobotError and RecordingError end the run.
     """
-    _phase(context, index, StationState.SETTLING, "settling")
+    _enter(context, index, StationState.SETTLING)
     async with ImageWatch(context, index) as watch:
         still = await context.stillness.settle(context.cell.arm.check, watch.look)
-    _phase(context, index, StationState.CAPTURING, "capturing")
+    _enter(context, index, StationState.CAPTURING)
     image = context.require_recording().number(await take_image(context, index))
     state, bound_s = await at_exposure(context, image)
     stamps = Stamps(
@@ -67,12 +67,11 @@ async def take_pose(context: SessionContext, index: int, attempt: int, unchecked
         time_bound_s=bound_s,
         stillness=still,
     )
-    _phase(context, index, StationState.WRITING, "writing")
+    _enter(context, index, StationState.WRITING)
     await to_the_end(_write(context, index, image, view, unchecked))
 
 
-def _phase(context: SessionContext, index: int, state: StationState, pose_state: PoseState) -> None:
-    context.loaded().mark(index, pose_state)
+def _enter(context: SessionContext, index: int, state: StationState) -> None:
     context.store.enter(state)
     context.show_poses(index)
 

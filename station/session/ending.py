@@ -8,7 +8,6 @@ from recordings.errors import ErrorData, RecordingError
 from station.cell.errors import SafetyStopError, StationError
 from station.cell.status import StationState
 from station.session.context import RunRequests, SessionContext
-from station.session.queue import BUSY
 from station.session.recording import to_the_end
 from station.session.threads import DISK
 
@@ -20,7 +19,7 @@ def failed(context: SessionContext, error: Exception) -> None:
     if isinstance(error, RecordingError):
         disk_failed(context, error)
         return
-    unmark_busy(context)
+    context.show_poses()
     if context.requests.halt:
         return
     if not isinstance(error, StationError):
@@ -68,17 +67,6 @@ def disk_failed(context: SessionContext, error: RecordingError | StationError) -
     else:
         context.store.enter(StationState.FAULT, reason)
     context.store.problem(reason, "error", context.store.status.session.current)
-    unmark_busy(context)
-
-
-def unmark_busy(context: SessionContext) -> None:
-    """Plan poses again whose capture a halt interrupted."""
-    queue = context.queue
-    if queue is None:
-        return
-    for status in queue.statuses:
-        if status.state in BUSY:
-            queue.mark(status.index, "planned", "interrupted")
     context.show_poses()
 
 

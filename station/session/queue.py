@@ -11,8 +11,6 @@ from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import PoseState, PoseStatus
 
-BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
-ENDED: frozenset[PoseState] = frozenset({"done", "skipped", "failed"})
 POSE_LIMIT = 2000
 TAKE_AGAIN = "to be captured again"
 STILL_COUNTS = "; its image counts until then"
@@ -24,15 +22,12 @@ class PoseQueue:
     """Poses in driving order."""
 
     def __init__(self, plan: Plan, restored: Sequence[PoseStatus] = ()) -> None:
-        """`restored`: states after a restart: poses that ended stay so, all others are planned again."""
+        """`restored`: states after a restart."""
         self.plan = plan
         """Plan with the poses added since it was loaded."""
         self._statuses = [_planned(plan, index) for index in range(len(plan.poses))]
         if [status.index for status in restored] == list(range(len(plan.poses))):
             self._statuses = list(restored)
-            for status in restored:
-                if status.state not in ENDED:
-                    self.note(status.index, state="planned")
 
     @property
     def statuses(self) -> tuple[PoseStatus, ...]:
@@ -90,26 +85,22 @@ class PoseQueue:
 
     def retake(self, index: int) -> None:
         """Plan a pose again, at its place in the order."""
-        status = self.status(index)
-        if status.state in BUSY:
-            raise _refused("pose-busy", index)
-        self.mark(index, "planned", TAKE_AGAIN + (STILL_COUNTS if status.counts else ""))
+        self.mark(index, "planned", TAKE_AGAIN + (STILL_COUNTS if self.status(index).counts else ""))
 
     def skip(self, index: int) -> None:
         """Skip a pose; if it has an image, only its retake is skipped, as the image stays recorded."""
         status = self.status(index)
-        state = status.state
-        if status.kept and state not in BUSY:
+        if status.kept:
             self.mark(index, "done", NOT_AGAIN)
             return
-        if state in BUSY or state == "done":
-            raise _refused("pose-busy" if state in BUSY else "pose-taken", index)
+        if status.state == "done":
+            raise refused("pose-taken", index)
         self.mark(index, "skipped", "skipped by the operator")
 
     def take_back(self, index: int) -> None:
         """Let the image of a pose that is done count no more. RefusedError where there is none."""
         if not self.status(index).counts:
-            raise _refused("pose-not-taken", index)
+            raise refused("pose-not-taken", index)
         self.note(index, state="skipped", reason=TAKEN_BACK, kept=False)
 
     def drop_last(self) -> None:
@@ -128,7 +119,7 @@ class PoseQueue:
         return index
 
 
-def _refused(code: str, index: int) -> RefusedError:
+def refused(code: str, index: int) -> RefusedError:
     return RefusedError(code, pose=index, number=index + 1)
 
 

@@ -19,7 +19,7 @@ from station.cell.stillness import JOGGED_RAD, NotStillError
 from station.devices.base import fresh
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
-from station.session.ending import failed, seal, unmark_busy
+from station.session.ending import failed, seal
 from station.session.motion import MotionApproval, require_start
 from station.session.stop_move import stop_half_way
 from station.session.threads import DISK, MOTION
@@ -46,12 +46,6 @@ class Run:
     async def drive(self) -> None:
         """Carry out the approval, ending in paused, stopped, fault or idle; raises only when cancelled."""
         try:
-            await self._drive_once()
-        finally:  # whoever waits for its end may begin the next
-            unmark_busy(self._context)
-
-    async def _drive_once(self) -> None:
-        try:
             if await self._begin():
                 await self._motion()
         except SafetyStopError as error:
@@ -60,7 +54,10 @@ class Run:
             await self._mover.stop(str(error))
             failed(self._context, error)
         finally:
-            await self._mover.end_control()
+            try:
+                await self._mover.end_control()
+            finally:  # no pose is under way any more
+                self._context.show_poses()
 
     async def _begin(self) -> bool:
         """Start control and open the recording. False when refused: the state is as before the approval."""
@@ -148,7 +145,6 @@ class Run:
         """Move to a pose from where the arm is. LimitError when the path is not free."""
         context, queue = self._context, self._queue
         here, target = (vector6(at.joints_rad) for at in (await context.ready_state(), queue.pose(index)))
-        queue.mark(index, "moving")
         context.store.enter(StationState.MOVING)
         context.show_poses(index)
         if np.abs(np.subtract(target, here)).max() < ARRIVED_RAD:

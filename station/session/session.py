@@ -36,7 +36,7 @@ from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
 from station.session.motion import ApprovalManager, offered, session_motion
 from station.session.previews import Previewer
-from station.session.queue import PoseQueue
+from station.session.queue import PoseQueue, refused
 from station.session.run import Run
 from station.session.stop_move import stop_motion
 from station.session.supervisor import SessionSupervisor
@@ -359,6 +359,9 @@ class Session:
         if self.store.state is StationState.FREE_DRIVE:
             await self.freedrive.take_back(verb.index)
             return
+        under_way = self.store.state in RUNNING and verb.index == self.store.status.session.current
+        if under_way and queue.status(verb.index).state == "planned":
+            raise refused("pose-busy", verb.index)
         change = queue.retake if isinstance(verb, verbs.Retake) else queue.skip
         change(verb.index)
         self.approvals.void()

@@ -12,7 +12,12 @@ from station.tui.capture_panels import hand_lines
 from station.tui.task import Known
 from station.tui.words import Mark, dim, duration, facts, lines, mark
 
-_STEPS = {"moving": "move", "settling": "settle", "capturing": "capture", "writing": "save"}
+_STEPS = {
+    StationState.MOVING: "move",
+    StationState.SETTLING: "settle",
+    StationState.CAPTURING: "capture",
+    StationState.WRITING: "save",
+}
 _MARKS: dict[str, Mark] = {"planned": "todo", "skipped": "todo", "done": "done", "failed": "failed"}
 CHIPS: dict[Mark, tuple[str, str]] = {
     "done": ("✓", "$ok on $okbg"),
@@ -32,7 +37,9 @@ def pose_line(status: StationStatus) -> Content:
         return dim(f"{again} to be captured again" if again else "resting")
     if pose.state == "failed":
         return mark("failed", pose.reason)
-    at = list(_STEPS).index(pose.state) if pose.state in _STEPS else (4 if pose.state == "done" else -1)
+    at = list(_STEPS).index(status.state) if status.state in _STEPS else -1
+    if pose.state == "done":
+        at = len(_STEPS)
     parts = []
     for i, word in enumerate(_STEPS.values()):
         if i == at:
@@ -87,7 +94,7 @@ def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
 def _chip(pose: PoseStatus, current: bool, cells: int) -> Content:
     number = f"{pose.index + 1:>{cells - 2}}"
     kind = pose_mark(pose)
-    if current and pose.state in _STEPS:
+    if current and pose.state == "planned":
         kind = "now"
     sign, style = CHIPS[kind]
     return Content.styled(f"{number}{'-' if pose.state == 'skipped' else sign} ", style)
@@ -95,4 +102,4 @@ def _chip(pose: PoseStatus, current: bool, cells: int) -> Content:
 
 def pose_mark(pose: PoseStatus) -> Mark:
     """Choose the mark of a pose."""
-    return "look" if pose.kept else _MARKS.get(pose.state, "now")
+    return "look" if pose.kept else _MARKS[pose.state]

@@ -20,12 +20,8 @@ from tests.tui.conftest import CELL, idle, in_session, with_robot
 
 def test_steps_of_a_pose_are_marked_one_after_the_other() -> None:
     first, *rest = idle().session.poses
-    moving = in_session(
-        idle(StationState.SETTLING),
-        poses=(msgspec.structs.replace(first, state="settling"), *rest),
-        current=0,
-    )
-    assert pose_line(moving).plain == "✓ move  ▶ settle  ○ capture ○ save"
+    settling = in_session(idle(StationState.SETTLING), current=0)
+    assert pose_line(settling).plain == "✓ move  ▶ settle  ○ capture ○ save"
     failed = msgspec.structs.replace(first, state="failed", reason="the board is cut")
     assert "the board is cut" in pose_line(in_session(idle(), poses=(failed, *rest), current=0)).plain
 
@@ -36,8 +32,6 @@ def test_the_chip_of_the_pose_under_way_is_always_there(
     count: int, current: int | None, width: int, rows: int
 ) -> None:
     poses = [PoseStatus(index=i, name=f"p{i}") for i in range(count)]
-    if current is not None:
-        poses[current] = msgspec.structs.replace(poses[current], state="moving")
     shown = [
         row.plain
         for row in chips(in_session(idle(), poses=tuple(poses), current=current).session, width, rows)

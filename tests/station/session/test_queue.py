@@ -6,25 +6,14 @@ import msgspec
 import pytest
 
 from station.cell.pose_plan import Plan, PlannedPose
-from station.cell.status import PoseState
 from station.session import queue as module
-from station.session.queue import BUSY, PoseQueue
+from station.session.queue import PoseQueue
 from tests.codes import raises
 
 
 def queue_of(count: int = 4) -> PoseQueue:
     poses = tuple(PlannedPose(f"p{i}", (0.1 * i, 0.0, 0.0, 0.0, 0.0, 0.0)) for i in range(count))
     return PoseQueue(Plan("UR10", "eye-in-hand", poses))
-
-
-@pytest.mark.parametrize("state", sorted(BUSY))
-def test_a_pose_that_is_being_taken_is_left_alone(state: PoseState) -> None:
-    queue = queue_of()
-    queue.mark(1, state)
-    for change in (queue.retake, queue.skip):
-        with raises("pose-busy"):
-            change(1)
-    assert queue.status(1).state == state
 
 
 def test_an_image_counts_until_another_takes_its_place() -> None:
@@ -37,7 +26,6 @@ def test_an_image_counts_until_another_takes_its_place() -> None:
     queue.skip(1)  # only its retake: the recording has the image
     assert (queue.status(1).state, queue.open) == ("done", (0, 2, 3))
     queue.retake(1)
-    queue.mark(1, "moving")
     assert PoseQueue(queue.plan, queue.statuses).done == 1  # after a crash on the way
     queue.mark(1, "failed", "too dark")
     assert queue.done == 1

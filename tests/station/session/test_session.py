@@ -26,7 +26,7 @@ from station.cell.layout import cell_geometry
 from station.cell.limits import check_path, with_plan_speeds
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.verbs import Purpose, StopTest
+from station.protocol.verbs import Purpose, Retake, Skip, StopTest
 from tests.codes import raises
 from tests.durability import disk_order
 from tests.patience import PATIENCE_S, until
@@ -104,7 +104,9 @@ async def test_a_pose_counts_only_once_it_is_on_the_disk(rig: Rig, held_disk: He
     await rig.give_go()
     await until(lambda: held_disk.asked > 0 or rig.session.store.status.session.captured > 0)
     assert rig.state is S.WRITING
-    assert rig.pose_states[0] == "writing"
+    for change in (Retake(0), Skip(0)):
+        with raises("pose-busy"):
+            await rig.session.edit(1, change)
     assert rig.session.store.status.session.captured == 0
     held_disk.set()
     await rig.until(S.IDLE)
@@ -127,7 +129,7 @@ async def test_stop_in_every_phase_is_latched_and_keeps_what_was_taken(rig: Rig,
     await asyncio.gather(*presses)
     assert rig.state is S.STOPPED
     assert "stop" in rig.arm.log
-    assert not {"moving", "settling", "capturing", "writing"} & set(rig.pose_states)
+    assert rig.session.store.status.session.current is None
     resume, run = rig.give_go(Purpose.RESUME), rig.session.prepare(1, Purpose.RUN)
     for forbidden in (resume, run, rig.session.finish(1)):
         with raises("wrong-state"):

@@ -96,10 +96,10 @@ def _errors(views: ViewSet, board: BoardSpec | None, out: Places, rest: Places) 
         alone = solve_views(replace(training, views=bare), options)
         seen = views if board is None else solve_pnp(replace(views, camera=joined.camera), board)
     assert joined.arm is not None and joined.arm.result is not None and joined.arm.uncorrected is not None
-    told, corrected = (
-        mount_poses(F, views.mount)
-        for F in (views.base_from_flange, joined.arm.result.corrected.forward(_joints(views)))
-    )
+    nominal = joined.arm.result.nominal_chain
+    errors = np.array([value for value, _ in joined.arm.errors.values()])[: len(nominal.link_errors)]
+    by_joints = nominal.with_errors(errors).forward(_joints(views))
+    told, corrected = (mount_poses(F, views.mount) for F in (views.base_from_flange, by_joints))
     C = seen.camera_from_board
     peers = (opencv_hand_eye(told[rest], C[rest], HAND_EYE[name]) for name in METHODS[3:])
     ways = ((corrected, joined.matrix), (told, joined.arm.uncorrected.X), (told, alone.matrix))

@@ -12,15 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from calibrate.arm_table import FramePose
 from calibrate.boards.model import ambiguity_text
 from calibrate.files.calibration import (
     FORMAT,
     Arm,
     ArmErrorValue,
     Calibration,
-    CorrectedArm,
-    FramePose,
-    HeldOutViews,
     Lens,
     Provenance,
     Quality,
@@ -30,9 +28,8 @@ from calibrate.files.calibration import (
     Views,
     ViewWeight,
 )
-from calibrate.geometry import Array, Transform
-from calibrate.handeye.solution import ArmResult, Solution
-from calibrate.kinematics import DhTable, table_of_axes
+from calibrate.geometry import Transform
+from calibrate.handeye.solution import Solution
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.projection import intrinsics_names
@@ -59,7 +56,6 @@ def make_calibration(
 ) -> Calibration:
     """`options`: the choices that differ from the defaults."""
     info = recording.info
-    arm = None if solution.arm is None else solution.arm.result
     frames, (X, covariance) = solution.parent_from_child, solution.installed
     return Calibration(
         format=FORMAT,
@@ -93,39 +89,9 @@ def make_calibration(
             recorded_wall_ns=info.created_wall_ns,
             plan_sha256=info.plan_sha256,
         ),
-        arm_table=None if arm is None else _arm_table(solution, arm),
+        arm_table=None if solution.arm is None else solution.arm.result,
         posterior=solution.posterior,
     )
-
-
-def _arm_table(solution: Solution, arm: ArmResult) -> CorrectedArm:
-    assert solution.arm is not None and solution.arm.uncorrected is not None
-    X = solution.parent_from_child
-    own = Transform(f"corrected_{X.parent}", X.child, X.matrix)
-    table, chain, offered = arm.table, arm.corrected, arm.offered
-    true = None if table is None else table_of_axes(table, chain.axes, chain.points, chain.flange)
-    return CorrectedArm(
-        offered=offered,
-        model="" if table is None else table.name,
-        nominal_source="learned" if table is None else "factory" if arm.factory else "published",
-        covariance=tuple(tuple(row) for row in arm.covariance.tolist()),
-        with_table_mm=1e3 * arm.error_m,
-        without_table_mm=1e3 * solution.arm.uncorrected.error_m,
-        joints_rad=[(low, high) for low, high in arm.joints_rad.T.tolist()],
-        held_out=None if arm.held_out_m is None else _held_out(arm.held_out_m),
-        refused=arm.refused or "",
-        nominal=None if table is None else DhTable.of(table),
-        learned=arm.nominal.plain if table is None else None,
-        corrected=DhTable.of(true) if true is not None and offered else None,
-        corrected_chain=chain.plain if true is None and offered else None,
-        result=FramePose.of(own) if offered else None,
-    )
-
-
-def _held_out(missed_m: Array) -> HeldOutViews:
-    """Sum up errors (2, n), NaN: none, of the arm as it is and of the corrected one."""
-    as_it_is, corrected = (1e3 * np.sqrt(np.nanmean(missed_m**2, axis=1))).tolist()
-    return HeldOutViews(as_it_is, corrected, int(np.isfinite(missed_m[0]).sum()))
 
 
 def solver_software() -> dict[str, str]:

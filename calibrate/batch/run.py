@@ -13,10 +13,11 @@ from pathlib import Path
 import cv2
 import msgspec
 
+from calibrate.arm_table import FramePose
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.document import solver_software
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import FramePose, Sigma, encode_calibration, write_output
+from calibrate.files.calibration import Sigma, encode_calibration, write_output
 from calibrate.files.integrity import content_sha256
 from calibrate.files.lines import append_line, read_lines
 from calibrate.job import JobOptions, solve_recording

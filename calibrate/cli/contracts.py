@@ -6,7 +6,8 @@ from typing import Literal
 
 import msgspec
 
-from calibrate.files.calibration import Arm, CorrectedArm, FramePose, Lens, SessionReading, Sigma, Views
+from calibrate.arm_table import CorrectedArm, FramePose
+from calibrate.files.calibration import Arm, Lens, SessionReading, Sigma, Views
 from calibrate.files.validity import Validity
 from calibrate.results import (
     BoardShape,

@@ -11,8 +11,9 @@ from typing import Annotated
 import msgspec
 import typer
 
+from calibrate.arm_table import FramePose
 from calibrate.cli.installed import CameraName, Root
-from calibrate.files.calibration import FramePose, Lens
+from calibrate.files.calibration import Lens
 from calibrate.files.formatting import SOURCE_STAMPS
 from calibrate.files.loader import InstallationChange, watch
 from calibrate.files.validity import Validity, validity_text

@@ -15,30 +15,26 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from calibrate.chain import Chain, chain_of
+from calibrate.arm_table import CorrectedArm, FramePose
 from calibrate.errors import CalibrationFileError
 from calibrate.files.integrity import check_result, content_sha256, read_bounded, verified_plain
 from calibrate.files.touch import Touch
-from calibrate.geometry import Array, Transform
-from calibrate.kinematics import DhTable
+from calibrate.geometry import Transform
 from calibrate.results import (
     BoardShape,
     Certificate,
     CrossValidation,
     Gate,
     HoldoutScore,
-    LearnedArm,
     Posterior,
     RejectedView,
     Remark,
 )
-from calibrate.views import array_of
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.schema.messages import (
     BoardSpec,
     CameraIdentity,
     CameraModel,
-    Matrix4,
     Mount,
     RobotIdentity,
     Source,
@@ -46,32 +42,7 @@ from recordings.schema.messages import (
 )
 
 FORMAT: Literal["handeye-calibration/2"] = "handeye-calibration/2"
-Vector3 = tuple[float, float, float]
 Verdict = Literal["PASS", "PASS WITH A REASON", "FAIL"]
-
-
-class FramePose(msgspec.Struct, frozen=True):
-    """parent_from_child: maps points of `child_frame` (metres) into `parent_frame`."""
-
-    parent_frame: str
-    child_frame: str
-    translation_m: Vector3
-    rotation_xyzw: tuple[float, float, float, float]
-    matrix: Matrix4
-
-    @classmethod
-    def of(cls, transform: Transform) -> FramePose:
-        return cls(
-            transform.parent,
-            transform.child,
-            tuple(transform.translation_m.tolist()),
-            tuple(transform.quaternion_xyzw.tolist()),
-            tuple(tuple(row) for row in transform.matrix.tolist()),
-        )
-
-    @property
-    def transform(self) -> Transform:
-        return Transform(self.parent_frame, self.child_frame, np.array(self.matrix))
 
 
 class Sigma(msgspec.Struct, frozen=True):
@@ -148,105 +119,6 @@ class Arm(msgspec.Struct, frozen=True):
     table: list[ArmErrorValue]
     size_mrad: float = 0.0
     """1σ of the links' turns; 0 in older files, whose `size_mm` is both."""
-
-
-class HeldOutViews(msgspec.Struct, frozen=True):
-    """Rms error of the board's middle in views predicted from views taken elsewhere."""
-
-    without_table_mm: float
-    with_table_mm: float
-    views: int
-
-
-class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
-    """X and the arm's corrected kinematics as one result, given only where offered.
-
-    This X is valid with these kinematics only: its frames are `corrected_base` and `corrected_flange`, which
-    chain with `base_from_flange` here and with nothing else. The file's own `result` is for the arm as it is.
-    The arm is a table, or a chain of axes that was learned from the recorded joints.
-    """
-
-    offered: bool
-    model: str
-    nominal_source: Literal["published", "factory", "learned"]
-    covariance: tuple[tuple[float, ...], ...]
-    """Of X's [δt, δφ] and of the errors of the arm's links, as in `quality.arm.table`; metres, radians."""
-    with_table_mm: float
-    """1σ of a point at the working distance with the corrected arm, averaged over the arm's workspace, or
-    over `joints_rad`."""
-    without_table_mm: float
-    """The same for the uncorrected arm with `result` of the file."""
-    nominal: DhTable | None = None
-    """Table that the recorded flanges follow."""
-    learned: LearnedArm | None = None
-    """Chain that the recorded flanges follow, where they follow no table."""
-    joints_rad: list[tuple[float, float]] = []
-    """Least and greatest of each joint in the recording; a learned chain is not asked beyond."""
-    held_out: HeldOutViews | None = None
-    refused: str = ""
-    """Reason why it is not offered: no-evidence, no-joints, not-nominal, not-better; empty: offered."""
-    corrected: DhTable | None = None
-    corrected_chain: LearnedArm | None = None
-    """The corrected arm as a chain, where `learned` is one."""
-    result: FramePose | None = None
-    """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera."""
-
-    def __post_init__(self) -> None:
-        frames = ("", "") if self.result is None else (self.result.parent_frame, self.result.child_frame)
-        known = frames in (("corrected_flange", "camera"), ("corrected_base", "camera"))
-        kinds = [arm is not None for arm in (self.nominal, self.learned)]
-        given = [arm is not None for arm in (self.corrected, self.corrected_chain)]
-        if not (self.offered == known == (self.result is not None)) or sum(kinds) != 1:
-            raise ValueError("the corrected arm and its X do not belong together")
-        if given != (kinds if self.offered else [False, False]):
-            raise ValueError("the corrected arm is of another kind than the nominal one")
-
-    def base_from_flange(self, joints_rad: ArrayLike) -> Transform:
-        """Compute corrected_base_from_corrected_flange of joints (n,).
-
-        Raises as `installable`; CalibrationFileError (`joints-beyond`) where a learned chain was not seen.
-        """
-        flange = self.chain.forward(self._within(joints_rad)[None])[0]
-        return Transform("corrected_base", "corrected_flange", flange)
-
-    def covariance_of_flange(self, joints_rad: ArrayLike) -> Array:
-        """Compute the covariance (6, 6) of `base_from_flange`, δt (m) and δφ (rad) in base. Raises as it."""
-        J = self.chain.by_links(self._within(joints_rad)[None])[0]
-        return np.asarray(J @ np.array(self.covariance)[6:, 6:] @ J.T)
-
-    @property
-    def chain(self) -> Chain:
-        """The corrected arm. Raises as `installable`."""
-        self.installable()
-        return _chain(self.corrected, self.corrected_chain)
-
-    @property
-    def nominal_chain(self) -> Chain:
-        """The arm as its controller computes it."""
-        return _chain(self.nominal, self.learned)
-
-    def installable(self) -> tuple[DhTable | None, Transform]:
-        """Return the table, if it is one, and the X that belongs to it. CalibrationFileError if refused."""
-        if self.result is None:
-            raise CalibrationFileError("table-not-offered", reason=self.refused)
-        return self.corrected, self.result.transform
-
-    def _within(self, joints_rad: ArrayLike) -> Array:
-        q = array_of(joints_rad, self.nominal_chain.posture_rad.shape, "joints_rad")
-        for joint, (low, high) in enumerate(self.joints_rad if self.learned else (), start=1):
-            if not low <= (at := float(q[joint - 1])) <= high:
-                low_deg, at_deg, high_deg = (math.degrees(v) for v in (low, at, high))
-                raise CalibrationFileError(
-                    "joints-beyond", joint=joint, at_deg=at_deg, low_deg=low_deg, high_deg=high_deg
-                )
-        return q
-
-
-def _chain(table: DhTable | None, chain: LearnedArm | None) -> Chain:
-    if chain is not None:
-        return Chain.of(chain)
-    assert table is not None  # one of them: `__post_init__`
-    return chain_of(table)
 
 
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.geometry import Array, difference, perturb
+from calibrate.arm_table import CorrectedArm, FramePose, HeldOutViews
+from calibrate.geometry import Array, Transform, difference, perturb
 from calibrate.handeye.arm import ArmPostures
 from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
-from calibrate.handeye.solution import ArmRefusal, ArmResult, UncorrectedArm
+from calibrate.handeye.solution import UncorrectedArm, camera_frames
 from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
+from calibrate.kinematics import DhTable, table_of_axes
 
 _NOMINAL_M = 1e-4
 """Above this rms distance (m) the recorded flanges were not computed with the nominal arm."""
@@ -17,10 +19,11 @@ _NOMINAL_M = 1e-4
 
 def arm_results(
     fit: CellFit, arm: ArmPostures, detected: bool, distance_m: float, missed: Array | None
-) -> tuple[UncorrectedArm, ArmResult]:
+) -> tuple[UncorrectedArm, CorrectedArm]:
     """Derive from a fit the X for the arm as it is, and the corrected arm.
 
-    missed: (2, n), as `ArmResult.held_out_m`.
+    missed: (2, n) error, m, of views predicted from those taken elsewhere, by the arm as it is and by the
+    corrected one; NaN: none.
     """
     found, state, chain, table = fit.estimate, fit.estimate.state, arm.chain, arm.table
     count = len(chain.link_errors)
@@ -42,20 +45,38 @@ def arm_results(
     uncorrected = UncorrectedArm(
         perturb(state.X, by_errors @ errors), both @ covariance @ both.T, float(np.hypot(corrected_m, left_m))
     )
-    return uncorrected, ArmResult(
-        nominal=chain,
-        corrected=chain.with_errors(errors),
-        table=table,
-        factory=fit.views.arm is not None,
-        joints_rad=np.array([arm.joints_rad.min(axis=0), arm.joints_rad.max(axis=0)]),
-        covariance=covariance,
-        error_m=corrected_m,
-        held_out_m=missed,
-        refused=_refusal(fit, arm, detected, missed),
+    refused, corrected = _refusal(fit, arm, detected, missed), chain.with_errors(errors)
+    offered = not refused
+    true = None
+    if table is not None and offered:
+        true = DhTable.of(table_of_axes(table, corrected.axes, corrected.points, corrected.flange))
+    parent, child = camera_frames(fit.views.mount)
+    return uncorrected, CorrectedArm(
+        offered=offered,
+        model="" if table is None else table.name,
+        nominal_source="learned" if table is None else "published" if fit.views.arm is None else "factory",
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
+        with_table_mm=1e3 * corrected_m,
+        without_table_mm=1e3 * uncorrected.error_m,
+        nominal=None if table is None else DhTable.of(table),
+        learned=chain.plain if table is None else None,
+        joints_rad=[(min(q), max(q)) for q in arm.joints_rad.T.tolist()],
+        held_out=None if missed is None else _held_out(missed),
+        refused=refused,
+        corrected=true,
+        corrected_chain=corrected.plain if table is None and offered else None,
+        result=FramePose.of(Transform(f"corrected_{parent}", child, state.X)) if offered else None,
     )
 
 
-def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | None) -> ArmRefusal | None:
+def _held_out(missed: Array) -> HeldOutViews:
+    """Sum up errors (2, n), NaN: none, of the arm as it is and of the corrected one."""
+    as_it_is, corrected = (1e3 * np.sqrt(np.nanmean(missed**2, axis=1))).tolist()
+    return HeldOutViews(as_it_is, corrected, int(np.isfinite(missed[0]).sum()))
+
+
+def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | None) -> str:
+    """Say why the corrected arm is not offered, as `CorrectedArm.refused`."""
     if not detected:
         return "no-evidence"
     if not arm.recorded:
@@ -65,5 +86,5 @@ def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | Non
         return "not-nominal"
     if missed is not None:
         as_it_is, corrected = np.nanmean(missed**2, axis=1)
-        return None if corrected < as_it_is else "not-better"
-    return None
+        return "" if corrected < as_it_is else "not-better"
+    return ""

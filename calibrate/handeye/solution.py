@@ -12,13 +12,12 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from calibrate.chain import Chain
+from calibrate.arm_table import CorrectedArm
 from calibrate.errors import require_choice, require_positive
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.kinematics import RobotModel
 from calibrate.results import (
     BoardShape,
     Certificate,
@@ -99,38 +98,6 @@ class Finding:
 
 
 @dataclass(frozen=True, eq=False)
-class ArmResult:
-    """X and the corrected arm as one result."""
-
-    nominal: Chain
-    """The arm as its controller computes it."""
-    corrected: Chain
-    table: RobotModel | None
-    """What `nominal` restates; None: it was learned."""
-    factory: bool
-    """`table` is the maker's calibration of this arm, not the published one."""
-    joints_rad: Array
-    """(2, n) least and greatest of each joint in the views."""
-    covariance: Array
-    """(6 + q, 6 + q) of X (as `Solution.parent_from_child`) and of the links' errors (`Chain.by_links`)."""
-    error_m: float
-    """1σ of a point over the workspace of a table, or over the range of the joints."""
-    held_out_m: Array | None
-    """(2, n) error of views predicted from those taken elsewhere: by the arm as it is, by the corrected."""
-    refused: ArmRefusal | None
-    """Reason why the corrected arm is not offered; None where it is."""
-
-    @property
-    def offered(self) -> bool:
-        return self.refused is None
-
-
-ArmRefusal = Literal["no-evidence", "no-joints", "not-nominal", "not-better"]
-"""No clear evidence; joints by inverse kinematics; recorded flanges do not follow the nominal arm; the
-corrected one does not help on poses elsewhere."""
-
-
-@dataclass(frozen=True, eq=False)
 class UncorrectedArm:
     """The X for an arm that stays as it is, with its errors: what its controller's flanges need."""
 
@@ -156,7 +123,7 @@ class ArmErrors:
     """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
     uncorrected: UncorrectedArm | None = None
     """None where the arm's kinematics are not known: only the bracket is modelled."""
-    result: ArmResult | None = None
+    result: CorrectedArm | None = None
     """None as `uncorrected`."""
 
     @property

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
-from calibrate.files.calibration import Calibration, FramePose
+from calibrate.arm_table import FramePose
+from calibrate.files.calibration import Calibration
 from calibrate.files.exports import export
 from calibrate.geometry import Array, Transform, pose, rotation_exp
 from recordings.schema.messages import CameraIdentity, RobotIdentity

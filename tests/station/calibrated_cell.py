@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibrate.arm_table import FramePose
 from calibrate.boards.model import board_points
-from calibrate.files.calibration import (
-    FORMAT,
-    Calibration,
-    FramePose,
-    Lens,
-    Provenance,
-    Quality,
-    Sigma,
-    Views,
-)
+from calibrate.files.calibration import FORMAT, Calibration, Lens, Provenance, Quality, Sigma, Views
 from calibrate.geometry import Array, Transform, inverse, perturb
 from calibrate.projection import project_at
 from calibrate.results import Certificate

@@ -10,8 +10,9 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
+from calibrate.arm_table import CorrectedArm
 from calibrate.errors import UsageError
-from calibrate.files.calibration import Calibration, CorrectedArm
+from calibrate.files.calibration import Calibration
 from calibrate.files.exports.formats import export_format
 from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment
 from calibrate.files.integrity import content_sha256

@@ -16,9 +16,10 @@ from xml.parsers import expat
 
 import numpy as np
 
+from calibrate.arm_table import CorrectedArm
 from calibrate.chain import Chain
 from calibrate.errors import UsageError
-from calibrate.files.calibration import Calibration, CorrectedArm
+from calibrate.files.calibration import Calibration
 from calibrate.files.exports.frames import FrameNames, comment
 from calibrate.files.exports.models import camera, commented, numbers, table_of
 from calibrate.geometry import (

@@ -11,16 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scene import random_rotation
+from calibrate.arm_table import CorrectedArm, FramePose
 from calibrate.chain import Chain, learn_chain
 from calibrate.errors import BadViewsError, CalibrationFileError, UsageError
 from calibrate.files import exports
-from calibrate.files.calibration import (
-    Calibration,
-    CorrectedArm,
-    FramePose,
-    decode_calibration,
-    encode_calibration,
-)
+from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration
 from calibrate.files.exports import FrameNames
 from calibrate.geometry import Array, Transform, inverse, pose, rotation_exp
 from calibrate.job import SolvedRecording

@@ -15,16 +15,11 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from calibrate.arm_table import CorrectedArm, FramePose
 from calibrate.chain import chain_of
 from calibrate.errors import CalibrationError, InstallError, UsageError
 from calibrate.files import exports
-from calibrate.files.calibration import (
-    Calibration,
-    CorrectedArm,
-    FramePose,
-    decode_calibration,
-    encode_calibration,
-)
+from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, inverse, pose, rotation_exp

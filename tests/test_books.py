@@ -33,7 +33,7 @@ def pages() -> list[Path]:
 def prepare(folder: Path) -> None:
     """Make what a cell or a reader has before the first page."""
     write_session(folder / "session.mcap", Scene(views=14), known_lens=True, source="real")
-    write_session(folder / "new.mcap", Scene(views=6, seed=5), known_lens=True, source="real", name="new")
+    write_session(folder / "new.mcap", Scene(views=6, seed=17), known_lens=True, source="real", name="new")
     run("calibrate solve session.mcap -o cell.yaml")
     found = read_calibration(folder / "cell.yaml")
     write_calibration(shifted(found, 1e-5), folder / "cell.yaml")

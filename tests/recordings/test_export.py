@@ -19,9 +19,19 @@ from recordings.importers.folder import import_folder
 from recordings.importers.messages import Kind
 from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording
+from recordings.schema.messages import RobotIdentity, Stamps
+from recordings.schema.viewing import base_from_flange
 from recordings.writer import RecordingWriter
 from tests.command_line import call
-from tests.recordings.small_recording import make_image, make_info, make_picture, make_view, refused
+from tests.recordings.small_recording import (
+    START_NS,
+    make_image,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    refused,
+)
 
 
 def test_a_folder_export_imports_as_the_same_views(small: Path, tmp_path: Path) -> None:
@@ -99,6 +109,27 @@ def test_images_of_no_pose_that_counts_stay_out_of_a_bag_and_their_number_is_tol
     assert re.findall(r"\d+", done.stdout.removeprefix(str(tmp_path))) == ["1", "2"]
     bag = open_bag(tmp_path / "out")
     assert [topic.messages for topic in bag.topics.values() if topic.kind is Kind.IMAGE] == [1]
+
+
+def test_a_bag_tells_flange_and_images_as_they_were_recorded(tmp_path: Path) -> None:
+    tool = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+    info = make_info(robot=RobotIdentity(tcp_offset=tool))
+    with RecordingWriter(tmp_path / "a.mcap", info) as writer:
+        for count in range(10):
+            writer.robot_state(make_state(count))
+        mosaic = msgspec.structs.replace(make_picture(1), pixel_format="BayerGR8")
+        for index, each in enumerate([(make_picture(0),), (mosaic, encode_png(make_image(1)))]):
+            writer.image(*each)
+            writer.view(msgspec.structs.replace(make_view(index), stamps=Stamps()))  # as imported
+        recording = open_recording(writer.finish())
+    bag = open_bag(export_recording(recording, tmp_path / "out", "ros2"))
+    (raw,), (file,) = map(bag.images, ("/camera/image_raw", "/camera/image_raw/compressed"))
+    assert (raw.encoding, file.encoding) == ("mono8", "bayer_grbg8")
+    assert [raw.stamp_ns, file.stamp_ns] == [START_NS, START_NS + 10**9], "those without a time are in order"
+    first, *others = (frame for told in bag.values("/tf") for frame in told)
+    flange = base_from_flange(make_state(0).tcp_pose, tool)
+    np.testing.assert_allclose(first.position_m, [row[3] for row in flange[:3]])
+    assert len(others) == 3, "at 0 and 10 ms, and of two views"
 
 
 @pytest.mark.parametrize("encoded", [None, encode_png(make_image(0))])

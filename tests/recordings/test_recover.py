@@ -12,18 +12,39 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from mcap.writer import Writer
 
 from recordings.files import create_exclusively
+from recordings.mcap.records import with_crc
 from recordings.reader import open_recording
 from recordings.recover import recover_recording
-from recordings.schema.messages import CameraModel
+from recordings.schema.definitions import encode
+from recordings.schema.messages import NO_PICTURE, CameraModel
 from recordings.schema.topics import Topic
 from recordings.writer import RecordingWriter
 from tests.durability import disk_order, full
-from tests.recordings.small_recording import make_info, make_picture, make_view, refused, write_small
+from tests.recordings.crafted import (
+    channel,
+    chunk,
+    message,
+    metadata,
+    schema,
+    sealed,
+    session_metadata,
+    write,
+)
+from tests.recordings.small_recording import (
+    TURNED,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    refused,
+    write_small,
+)
 
 
 def write_unfinished(path: Path, poses: int = 2, **info: object) -> Path:
@@ -47,6 +68,31 @@ def test_an_unfinished_file_takes_its_name_and_the_damaged_one_is_kept(tmp_path:
     assert recording.attachments() == {"plan.yaml": b"poses: 2\n"}
     assert result.kept_original.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "a.mcap.part.damaged"]
+
+
+def test_pairs_without_images_are_saved(tmp_path: Path) -> None:
+    told = msgspec.structs.replace(make_view(0), picture_sequence=NO_PICTURE, camera_from_board=TURNED)
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.view(told)
+    recover_recording(writer.part_path)
+    assert open_recording(tmp_path / "a.mcap").views() == [told]
+
+
+@pytest.mark.parametrize("declared", [(1, "/diagnostics"), (3, "/robot/state")])
+def test_a_channel_is_not_named_by_numbers_that_another_program_changed(
+    tmp_path: Path, declared: tuple[int, str]
+) -> None:
+    """Of their file, which kept our records of the channels, one declaration is whole."""
+    number, topic = declared
+    told = enumerate(("/robot/state", "/session/event"), start=1)
+    records = b"".join(metadata(f"channel-{n}", with_crc({"topic": ours})) for n, ours in told)
+    whole = chunk(
+        schema(1, Topic.ROBOT_STATE) + channel(number, 1, topic) + message(number, encode(make_state(0)))
+    )
+    path = write(tmp_path, sealed(session_metadata() + records + whole + chunk(message(2, b"{}")))[:-9])
+    (result,) = recover_recording(path)
+    assert list(open_recording(path).segments[0].topics) == [topic] and result.lost_bytes
+    assert result.robot_states == (topic == "/robot/state")
 
 
 def test_a_whole_file_that_only_missed_its_rename_is_renamed(small: Path) -> None:

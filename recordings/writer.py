@@ -207,7 +207,6 @@ class RecordingWriter:
     def finish(self) -> Path:
         """Finishes the file, renames it, and returns its final path."""
         with self._disk():
-            self._copy_session()
             self._mcap.finish()
             os.fsync(self._file.descriptor)
             rename_new(self.part_path, self.path)

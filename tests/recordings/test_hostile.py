@@ -10,6 +10,7 @@ from pathlib import Path
 
 import lz4.frame
 import msgspec
+import numpy as np
 import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
@@ -22,6 +23,7 @@ from recordings.recover import recover_recording
 from recordings.schema.definitions import encode
 from recordings.schema.messages import RobotState
 from recordings.schema.topics import Topic
+from recordings.writer import RecordingWriter
 from tests.recordings.crafted import (
     attachment,
     channel,
@@ -35,7 +37,7 @@ from tests.recordings.crafted import (
     text,
     write,
 )
-from tests.recordings.small_recording import make_info, make_state, make_view, refused
+from tests.recordings.small_recording import make_info, make_picture, make_state, make_view, refused
 
 STATE_SCHEMA = schema(1, Topic.ROBOT_STATE)
 STATE_CHANNEL = channel(1, 1, "/robot/state")
@@ -225,6 +227,27 @@ def test_messages_that_are_wrong_in_themselves_name_their_place(tmp_path: Path) 
             "damaged-recording", at_byte=recording.segments[0].messages(Topic.ROBOT_STATE).addresses[0]
         ):
             list(recording.robot_states())
+
+
+@pytest.mark.parametrize(
+    "T",
+    [
+        np.diag([1.0, 1, -1, 1]),
+        np.diag([2.0, 2, 2, 1]),
+        np.diag([1.0, 1, 1, 2]),
+        np.eye(4) * np.nan,
+        np.eye(3),
+    ],
+    ids=["mirrored", "scaled", "last row", "no number", "3 by 3"],
+)
+def test_a_view_whose_pose_is_none_is_refused(tmp_path: Path, T: np.ndarray) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.robot_state(make_state(0))  # else viewers would be shown the view's pose
+        writer.image(make_picture(0))
+        writer.view(msgspec.structs.replace(make_view(0), base_from_flange=T.tolist()))
+        path = writer.finish()
+    with refused("damaged-recording"):
+        open_recording(path)
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -62,7 +62,10 @@ def test_recover_makes_the_list_where_there_was_none(tmp_path: Path) -> None:
     assert len(open_recording(tmp_path / "session-2.mcap").losses) == 1
 
 
-def test_a_part_that_held_nothing_is_not_missing(session: Path) -> None:
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_part_that_held_nothing_is_not_missing(session: Path, listed: bool) -> None:
+    if not listed:
+        (session / MANIFEST_FILE).unlink()
     (session / "session-2.mcap").unlink()
     (session / "session-2.mcap.part").write_bytes(b"\x89MCAP0\r\n")
     recover_recording(session)

@@ -16,7 +16,8 @@ from recordings.importers.stops import StandstillLimits, find_stops, proposed_li
 
 def frame(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> FrameMessage:
     x, y, z = T[:3, 3].tolist()
-    qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    sign = 1 - 2 * (stamp_ns // 1000 % 2)  # q and -q are one rotation
+    qx, qy, qz, qw = (sign * Rotation.from_matrix(T[:3, :3]).as_quat()).tolist()
     return FrameMessage(stamp_ns, parent, child, (x, y, z), (qx, qy, qz, qw))
 
 
@@ -92,6 +93,9 @@ def test_an_arm_that_drifts_slowly_does_not_stand() -> None:
     assert find_stops(track, images, None, StandstillLimits(), 0.05)[0] == []
     assert len(find_stops(track, images, None, StandstillLimits(position_m=0.001), 0.05)[0]) == 1
     assert find_stops(track, images, None, StandstillLimits(0.0, 0.0), 0.05)[0] == []
+    fast = np.array([900_000_000, 1_900_000_000], np.int64), np.array([0.1, 0.0])
+    (stop,) = find_stops(track, images, fast, StandstillLimits(position_m=0.001), 0.05)[0]
+    assert stop.place == 1, "a joint turned before the first image"
 
 
 def test_limits_come_from_an_arm_that_reports_with_more_noise() -> None:

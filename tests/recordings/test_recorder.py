@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from recordings import recorder as recorder_module
+from recordings import writer as writer_module
 from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording
 from recordings.recorder import Recorder
@@ -133,6 +134,20 @@ def test_data_reach_the_system_and_the_disk_without_being_asked(
     recorder.close()
 
 
+def test_what_is_on_the_disk_leaves_the_page_cache_but_for_the_newest_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[int, int, int]] = []
+    monkeypatch.setattr(os, "posix_fadvise", lambda descriptor, *advice: told.append(advice))
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.image(make_picture(0))
+        size_bytes = writer.part_path.stat().st_size
+        for kept_bytes in (size_bytes, 1000):
+            monkeypatch.setattr(writer_module, "KEPT_IN_MEMORY_BYTES", kept_bytes)
+            writer.sync()
+    assert told == [(0, size_bytes - 1000, os.POSIX_FADV_DONTNEED)], "a length of 0 would be all of it"
+
+
 def test_what_a_sync_was_asked_for_has_left_the_process(tmp_path: Path) -> None:
     """Also where no image or view ended the open chunk."""
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
@@ -252,20 +267,16 @@ def test_waiting_syncs_fail_with_the_error_and_nobody_hangs(
             future.result(PATIENCE_S)
 
 
-@pytest.mark.parametrize("call", ["fdatasync", "fsync"])
-def test_an_error_of_the_sync_itself_is_as_final(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
-) -> None:
+def test_an_error_of_the_last_sync_is_as_final(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: 0.0)
     recorder.image(make_picture(0))
 
     def fail(descriptor: int) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(os, call, fail)
-    for end in [recorder.sync] * (call == "fdatasync") + [recorder.finish]:
-        with refused("disk", errno=errno.EIO):
-            end().result(PATIENCE_S)
+    monkeypatch.setattr(os, "fsync", fail)
+    with refused("disk", errno=errno.EIO):
+        recorder.finish().result(PATIENCE_S)
     assert not (tmp_path / "a.mcap").exists()
 
 

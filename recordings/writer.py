@@ -86,8 +86,7 @@ class RecordingWriter:
             # Nothing is in it, and its name is wanted for the next try.
             self.part_path.unlink(missing_ok=True)
             raise disk_error("begin", path, error, _FREE_SPACE) from error
-        if info.camera.matrix is not None:
-            self.camera_model(info.camera)
+        self.camera_model(info.camera)
 
     def robot_state(self, state: RobotState) -> None:
         time_ns = self._time_ns(state.stamps)
@@ -170,10 +169,10 @@ class RecordingWriter:
         self._show(Topic.LOG, viewing.log_line(event, time_ns), time_ns)
 
     def camera_model(self, model: CameraModel) -> None:
-        """Intrinsics for viewers; what calibrate uses is `SessionInfo.camera`."""
-        self._show(
-            Topic.CAMERA_CALIBRATION, viewing.camera_calibration(model, self._start_ns), self._start_ns
-        )
+        """Intrinsics for viewers, where they are known; what calibrate uses is `SessionInfo.camera`."""
+        if model.matrix is not None:
+            message = viewing.camera_calibration(model, self._start_ns)
+            self._show(Topic.CAMERA_CALIBRATION, message, self._start_ns)
 
     def attach(self, name: str, media_type: str, content: bytes) -> None:
         """Add a small file to the recording, such as `plan.yaml`."""

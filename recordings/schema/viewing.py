@@ -69,7 +69,7 @@ def compressed_image(data: bytes, format: str, time_ns: int) -> Any:
 
 
 def camera_calibration(model: CameraModel, time_ns: int) -> Any:
-    """The intrinsics as a message."""
+    """The intrinsics, which must be known, as a message."""
     message = CameraCalibration(
         frame_id=CAMERA_FRAME,
         width=model.width,
@@ -77,7 +77,7 @@ def camera_calibration(model: CameraModel, time_ns: int) -> Any:
         distortion_model=_FISHEYE.get(model.distortion_model, model.distortion_model),
         D=model.distortion,
     )
-    K = np.array(model.matrix or np.zeros((3, 3)), float)  # zeros, as Foxglove expects it: not calibrated
+    K = np.array(model.matrix, float)
     message.K.extend(K.ravel())
     message.R.extend(np.eye(3).ravel())
     message.P.extend(np.column_stack([K, np.zeros(3)]).ravel())

@@ -93,9 +93,9 @@ def test_an_arm_that_drifts_slowly_does_not_stand() -> None:
     assert find_stops(track, images, None, StandstillLimits(), 0.05)[0] == []
     assert len(find_stops(track, images, None, StandstillLimits(position_m=0.001), 0.05)[0]) == 1
     assert find_stops(track, images, None, StandstillLimits(0.0, 0.0), 0.05)[0] == []
-    fast = np.array([900_000_000, 1_900_000_000], np.int64), np.array([0.1, 0.0])
+    fast = np.array([900_000_000, 1_900_000_000], np.int64), np.array([0.0, 0.1])
     (stop,) = find_stops(track, images, fast, StandstillLimits(position_m=0.001), 0.05)[0]
-    assert stop.place == 1, "a joint turned before the first image"
+    assert stop.place == 0, "a joint turned before the second image"
 
 
 def test_limits_come_from_an_arm_that_reports_with_more_noise() -> None:

@@ -241,6 +241,7 @@ def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -
     result = call(main, "import", folder, "-o", output, "--json")
     assert result.returncode == 0
     assert json.loads(result.stdout) == {"recording": str(output), "views": 3, "bytes": output.stat().st_size}
+    assert json.loads(call(main, "info", output, "--json").stdout)["robot_states"] is None
 
 
 def test_a_source_that_is_none_is_named_before_what_it_lacks(small: Path) -> None:

@@ -13,9 +13,8 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from recordings.images import encode_png
-from recordings.info import recording_info
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, CaptureEvent, FrameTime, Image, Stamps
+from recordings.schema.messages import CaptureEvent, FrameTime, Image, Stamps
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import (
     HEIGHT,
@@ -129,16 +128,6 @@ def test_pictures_of_another_size_or_twice_and_views_of_none_are_refused(tmp_pat
             writer.image(make_picture(1, make_image(1, 40, 30)))
         with refused("bad-image"):
             writer.image(make_picture(2, np.zeros((HEIGHT, WIDTH), np.float32)))
-
-
-def test_an_unfinished_camera_model_is_written_as_uncalibrated(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "b.mcap", make_info(camera=CameraModel(WIDTH, HEIGHT))) as writer:
-        writer.camera_model(CameraModel(WIDTH, HEIGHT))
-        path = writer.finish()
-    with path.open("rb") as file:
-        (message,) = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-    assert list(message.decoded_message.K) == [0.0] * 9
-    assert recording_info(open_recording(path)).robot_states is None
 
 
 def test_a_disk_that_takes_little_at_a_time_gets_everything(

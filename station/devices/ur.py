@@ -103,7 +103,7 @@ class UrRobot(UrLink):
         """
         if self._child is not None:
             raise RobotError("control-started")
-        self._stop_reason, self._ended_by = "", None
+        self._stop_reason, self._ended_by, self._relied_on = "", None, True
         await self.idle()  # a child that is still ending keeps the registers
         await ready(self)
         await self.may_start()

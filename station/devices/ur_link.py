@@ -11,6 +11,8 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 
+import msgspec
+
 from calibrate.kinematics import MODELS
 from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState
 from station.cell.clock_fit import ClockFit
@@ -61,6 +63,8 @@ class UrLink:
         self._subscribers: list[Callable[[RobotState], None]] = []
         self._primary: PrimaryReader | None = None
         self._tool: TcpCheck | None = None
+        self._relied_on = False
+        """A picture or a motion relies on the TCP offset taken at connect."""
         self._payload: Payload | None = None
         """The payload at connect."""
         self._trouble: RobotError | None = None
@@ -123,8 +127,7 @@ class UrLink:
         if self._payload is None:
             self._payload = first.payload
         if self._tool is None:
-            calibrated = self.config.kinematics is not None
-            self._tool = TcpCheck(self.model, calibrated, first.state, installation)
+            self._tool = self._tool_of(first.state, installation)
         else:
             self._tool.check(first.state, installation)
         self.identity = RobotIdentity(
@@ -135,6 +138,17 @@ class UrLink:
             payload_kg=self._payload.mass_kg,
         )
 
+    def _tool_of(self, state: RobotState, installation: Installation) -> TcpCheck:
+        return TcpCheck(self.model, self.config.kinematics is not None, state, installation)
+
+    def _adopt_late_offset(self) -> None:
+        """Take the TCP offset that the controller states after connecting, where nothing relies on ours."""
+        told = self._primary.installation if self._primary is not None else Installation()
+        if told.tcp_offset is None or self._tool is None or self._tool.stated or self._relied_on:
+            return
+        self._tool = self._tool_of(self.latest(), told)
+        self.identity = msgspec.structs.replace(self.identity, tcp_offset=self._tool.offset)
+
     async def close(self) -> None:
         """Close every connection and release the lock on the robot."""
         if self._supervisor is not None:
@@ -143,7 +157,7 @@ class UrLink:
             self._supervisor = None
         await self._close_link()
         self._unlock()
-        self._tool = self._payload = None
+        self._tool, self._payload, self._relied_on = None, None, False
         self._arrived_ns = 0
 
     def _unlock(self) -> None:
@@ -256,6 +270,7 @@ class UrLink:
 
     def at(self, host_monotonic_ns: int) -> RobotState:
         """Interpolate the state at a host time within the last 10 s; StaleStateError outside."""
+        self._relied_on = True
         if self.reader is None:
             raise not_connected(self.config.host)
         return state_at(self.states(), self.clock(), host_monotonic_ns)
@@ -344,6 +359,8 @@ class UrLink:
         if self.dashboard is None or not self.dashboard.alive:
             await self.renew_dashboard()
         assert self.dashboard is not None
+        self._relied_on |= self.in_motion
+        self._adopt_late_offset()
         if self.remote is not None:
             with contextlib.suppress(DashboardError):
                 self.remote = await self.dashboard.remote()

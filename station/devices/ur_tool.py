@@ -214,6 +214,11 @@ class TcpCheck:
         self._source = "controller"
 
     @property
+    def stated(self) -> bool:
+        """False where the offset was derived, as the controller did not state it."""
+        return self._stated is not None
+
+    @property
     def kinematics(self) -> ArmKinematics | None:
         """Calibrated table of this arm that explains the controller's tool pose; None: the published one."""
         m = self._model

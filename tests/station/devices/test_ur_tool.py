@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import random
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,7 +16,10 @@ import pytest
 from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import RobotState, Vector6
+from station.cell.config import RobotConfig
+from station.cell.errors import RobotError
 from station.devices import ur_tool
+from station.devices.ur import UrRobot
 from station.devices.ur_tool import PORT, Installation, PrimaryReader, TcpCheck, read_state
 from station.simulation.controller.primary import state
 from station.simulation.controller.robot import SimulatedRobot
@@ -140,6 +147,24 @@ def test_a_statement_that_comes_after_connecting_must_be_what_was_derived_there(
     nominal = TcpCheck(UR10, False, sample(FACTORY, HERE, TOOL), Installation())
     with raises("tcp-late"):  # derived with the published table: every pose would be millimetres off
         nominal.check(sample(FACTORY, HERE, TOOL), stated(FACTORY, TOOL))
+
+
+@pytest.mark.parametrize("used", [None, "at", "start_control", "guided"])
+async def test_it_is_taken_where_no_picture_and_no_motion_relies_on_the_derived_one(
+    used: str | None, tmp_path: Path
+) -> None:
+    robot: Any = UrRobot(RobotConfig(model="UR10", host="127.0.0.1"), tmp_path)
+    robot._tool = TcpCheck(UR10, False, sample(FACTORY, HERE, TOOL), Installation())
+    robot._primary = SimpleNamespace(installation=stated(FACTORY, TOOL), started="")
+    robot.latest, robot.dashboard = (lambda: sample(FACTORY, HERE, TOOL)), SimpleNamespace(alive=True)
+    robot.guided = used == "guided"
+    with suppress(RobotError):
+        if used == "at":
+            robot.at(0)
+        if used == "start_control":
+            await robot.start_control()
+    await robot.supervise_more()
+    assert (robot.identity.tcp_offset == TOOL) is (used is None)
 
 
 async def test_a_controller_that_is_slow_to_state_its_tool_is_waited_for(

@@ -16,7 +16,7 @@ from recordings.files import state_root
 from station.cell.child import ChildProcess, start_child
 from station.cell.errors import StationError
 from station.cell.socket_folder import default_socket, way_to_end
-from station.cli.console import Socket
+from station.cli.console import Socket, require_terminal
 from station.protocol.client import DaemonGoneError, ask
 from station.protocol.verbs import GetPlan
 
@@ -115,12 +115,7 @@ def tui_command(socket: Socket = None) -> None:
     The daemon gets a simulated cell where there is no configuration. With --socket none is started: the
     screen waits for the one that serves there.
     """
-    if not sys.stdout.isatty() or not sys.stdin.isatty():
-        raise StationError(
-            "no-terminal",
-            what="The operator screen",
-            advice="Without one use `station capture` or `station demo`.",
-        )
+    require_terminal("The operator screen", "Without one use `station capture` or `station demo`.")
     from station.tui.app import run
 
     # A socket that is named belongs to somebody: on a cell's console a second daemon would be a wrong one.

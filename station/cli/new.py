@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -10,9 +9,8 @@ from typing import Annotated
 import typer
 
 from recordings.files import state_root
-from station.cell.errors import StationError
 from station.cell.socket_folder import default_socket
-from station.cli.console import err
+from station.cli.console import err, require_terminal
 from station.cli.daemon import ensure_daemon, own_daemon, require_none, tell_what_goes_on, user_config
 from station.devices.guided import RealHardware
 from station.operate.cell_setup import CellSetup
@@ -32,12 +30,7 @@ def new_command(
 
     At the end Enter writes the file and opens the cell; F9 rehearses the whole job in simulation first.
     """
-    if not sys.stdout.isatty() or not sys.stdin.isatty():
-        raise StationError(
-            "no-terminal",
-            what="The wizard",
-            advice="Without one write a configuration: `station doctor --example`.",
-        )
+    require_terminal("The wizard", "Without one write a configuration: `station doctor --example`.")
     from station.tui.new_cell import run
 
     place = output or user_config()

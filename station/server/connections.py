@@ -87,9 +87,9 @@ class ClientServer:
             in_control = status.lease.client_id if status.state in RUNNING else None
             for connection in list(self._connections):
                 if connection.watching:
-                    unread_s = connection.unread_s()
+                    unread_s = connection.unread_s(connection.peer.client_id == in_control)
                     connection.send(line)
-                    if connection.peer.client_id == in_control and unread_s > UNREAD_LIMIT_S:
+                    if unread_s > UNREAD_LIMIT_S:
                         connection.abort()
         return status
 
@@ -178,8 +178,8 @@ class _Connection:
         self._reader, self._writer, self._handler = reader, writer, handler
         self._publish = publish
         self._tasks: set[asyncio.Task[None]] = set()
-        self._read_s = asyncio.get_running_loop().time()
-        """When the client was last seen to have read everything."""
+        self._works, self._read_s = False, 0.0
+        """The arm works by this client; when it had last read everything since then."""
 
     async def run(self) -> None:
         decoder = msgspec.json.Decoder(Request)
@@ -248,13 +248,18 @@ class _Connection:
         if self._writer.transport.get_write_buffer_size() > UNSENT_LIMIT_BYTES:
             self.abort()
 
-    def unread_s(self) -> float:
-        """For how long the client has left something unread: frozen, or its terminal is."""
+    def unread_s(self, works: bool) -> float:
+        """For how long the client has left something unread: frozen, or its terminal is.
+
+        `works`: the arm works by it. Else 0: a command reads nothing while its person is asked.
+        """
         link: socket.socket = self._writer.get_extra_info("socket")
-        now_s = asyncio.get_running_loop().time()
-        if not self._writer.is_closing() and not any(fcntl.ioctl(link.fileno(), termios.TIOCOUTQ, bytes(4))):
+        now_s, began = asyncio.get_running_loop().time(), works and not self._works
+        self._works = works
+        gone = self._writer.is_closing()
+        if began or not (gone or any(fcntl.ioctl(link.fileno(), termios.TIOCOUTQ, bytes(4)))):
             self._read_s = now_s
-        return now_s - self._read_s
+        return now_s - self._read_s if works else 0.0
 
     def abort(self) -> None:
         """End the connection of a client that does not read, at once."""

@@ -218,7 +218,10 @@ async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: R
 async def test_who_has_control_of_a_moving_arm_and_does_not_read_is_dropped(
     server: Served, handler: RecordingHandler, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A frozen `station capture`, or one whose ssh hangs, leaves nobody at the arm."""
+    """A frozen `station capture`, or one whose ssh hangs, leaves nobody at the arm.
+
+    What it left unread before, as while a person was asked, does not count.
+    """
     monkeypatch.setattr("station.server.connections.UNREAD_LIMIT_S", 0.0)
     control, path = server
     with socket.socket(socket.AF_UNIX) as frozen:
@@ -233,6 +236,9 @@ async def test_who_has_control_of_a_moving_arm_and_does_not_read_is_dropped(
                     assert not handler.lost
                     publish(control, state=state, lease=LeaseStatus("anna", holder))
                     await anext(statuses)
+            assert await client.request("doctor")
+            assert not handler.lost
+            publish(control, state=StationState.SETTLING, lease=LeaseStatus("anna", 1))
             await until(lambda: handler.lost)
             assert handler.lost == [1]
 

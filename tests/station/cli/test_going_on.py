@@ -95,6 +95,20 @@ async def test_nothing_but_lateness_is_gone_on_after(
     assert rig.state is state and shell.approved_again == 0
 
 
+async def test_a_persons_stop_is_not_acknowledged(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.arm.move, go_on = first_fails(rig.arm.move, LATE[:1]), Attended._go_on
+
+    async def stopped_meanwhile(shell: Attended) -> None:
+        await rig.session.stop("ben")
+        await go_on(shell)
+
+    monkeypatch.setattr(Attended, "_go_on", stopped_meanwhile)
+    await carried_out(rig, tmp_path)
+    assert rig.state is S.STOPPED and not rig.told("acknowledged")
+
+
 async def test_where_a_person_may_attend_they_go_on(rig: Rig, tmp_path: Path) -> None:
     rig.arm.move = first_fails(rig.arm.move, LATE[:1])
     await carried_out(rig, tmp_path, headless=False)

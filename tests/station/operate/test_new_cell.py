@@ -256,4 +256,5 @@ def test_a_fault_of_the_picture_is_named(fault: str, causes: set[str]) -> None:
     board = {"squares counted": COUNTED, "another board lies there": OTHER}.get(fault, PICTURED.board)
     status = sight(pixels, board, None, exposure=(10_000.0, 0.0)).status
     assert status.cause in causes and (bool(status.advice) or exposure_us is None)
-    assert not sight(pixels, board, None, False).status.advice, "an image of unknown exposure"
+    if exposure_us is not None:
+        assert not sight(pixels, board, None, False).status.advice, "an image of unknown exposure"

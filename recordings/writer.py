@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -66,8 +65,6 @@ class RecordingWriter:
         self.error: RecordingError | None = None
         self._start_ns = info.created_wall_ns or time.time_ns()
         self._channels: dict[Topic, int] = {}
-        self._unnumbered = Counter[Topic]()
-        """Messages written so far that the caller does not number."""
         self._images: dict[int, int] = {}
         """Sequence → time in the file."""
         self._shown_ns = 0
@@ -160,7 +157,7 @@ class RecordingWriter:
         message = viewing.frame_transform(parent, child, parent_from_child, time_ns)
         self._show(Topic.BOARD_TRANSFORM if child == "board" else Topic.FIXED_TRANSFORM, message, time_ns)
 
-    def _show(self, topic: Topic, message: Any, time_ns: int, sequence: int | None = None) -> None:
+    def _show(self, topic: Topic, message: Any, time_ns: int, sequence: int = 0) -> None:
         self._add(topic, message.SerializeToString(), time_ns, sequence)
 
     def event(self, event: CaptureEvent) -> None:
@@ -228,13 +225,11 @@ class RecordingWriter:
         """Wall time where there is one; imported images have none and follow each other by a second."""
         return stamps.host_wall_ns or self._start_ns + place * _SECOND_NS
 
-    def _add(self, topic: Topic, data: bytes, time_ns: int, sequence: int | None = None) -> None:
+    def _add(self, topic: Topic, data: bytes, time_ns: int, sequence: int = 0) -> None:
+        """`sequence`: an image's; of other messages MCAP's number says nothing."""
         with self._disk():
             channel = self._channels.get(topic) or self._channel(topic)
-            if sequence is None:
-                sequence = self._unnumbered[topic]
-                self._unnumbered[topic] += 1
-            self._mcap.add_message(channel, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
+            self._mcap.add_message(channel, time_ns, data, time_ns, sequence)
 
     def _channel(self, topic: Topic) -> int:
         schema = self._mcap.register_schema(schema_name(topic), "protobuf", schema_bytes(topic))

@@ -144,7 +144,7 @@ class RenderedCamera:
             # A cancelled call would end the process.
             return await asyncio.shield(self._workers.call(ask, name, *arguments, timeout_s=timeout_s))
         except WorkerError:
-            self._lost = True
+            self._lost = self._workers is not None  # else it was closed meanwhile
             raise CameraError("camera-gone", camera=self.identity.serial) from None
         except RobotError as error:
             raise CameraError("camera-refused", doing=name, reason=str(error)) from None

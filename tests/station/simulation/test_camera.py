@@ -15,6 +15,7 @@ from station.simulation.cells import make_cell
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
 from tests.codes import raises
+from tests.patience import until
 from tests.station.true_camera import board_seen
 
 pytestmark = pytest.mark.process
@@ -83,6 +84,16 @@ async def test_one_that_died_is_opened_again(camera: RenderedCamera) -> None:
     with raises("camera-gone"):
         await camera.capture()
     await camera.capture()
+
+
+async def test_one_that_is_closed_during_a_capture_stays_closed(camera: RenderedCamera) -> None:
+    taking = asyncio.create_task(camera.capture())
+    await until(lambda: camera._workers is not None and camera._workers.waiting)
+    await camera.close()
+    with raises("camera-gone"):
+        await taking
+    with raises("not-open"):
+        await camera.capture()
 
 
 async def test_while_it_starts_nothing_is_said_of_its_clock(

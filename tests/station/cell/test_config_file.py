@@ -182,11 +182,3 @@ def test_doctor_counts_what_is_missing_as_missing(tmp_path: Path) -> None:
     assert call(main, "doctor", "--config", str(path)).returncode == 1
     path.write_text(GOOD.replace("rows: 6", "rows: 1"))
     assert call(main, "doctor", "--config", str(path)).returncode == 2
-
-
-def test_the_example_that_doctor_prints_is_a_good_configuration(tmp_path: Path) -> None:
-    printed = call(main, "doctor", "--example")
-    path = tmp_path / "station.yaml"
-    path.write_text(printed.stdout)
-    assert printed.returncode == 0
-    assert call(main, "doctor", "--config", str(path)).returncode == 0

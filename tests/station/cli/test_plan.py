@@ -33,16 +33,11 @@ def test_a_plan_is_made_shown_and_saved(made):
     assert len(rows) == 12 and all(pose.why[:20] in row for pose, row in zip(plan.poses, rows, strict=True))
 
 
-def test_json_is_one_object_and_nothing_else(made):
-    result = run("--check", made[1], "--json")
-    summary = json.loads(result.stdout)
-    assert result.returncode == 0
-    assert summary["poses"] == 12
-    assert summary["problems"] == []
+def test_a_plan_passes_the_check_and_an_edited_one_that_hits_something_fails_it_with_1(made, tmp_path):
+    good = run("--check", made[1], "--json")
+    summary = json.loads(good.stdout)
+    assert (good.returncode, summary["poses"], summary["problems"]) == (0, 12, [])
     assert summary["top_speed_m_s"] <= 0.25 and summary["duration_s"] > 0
-
-
-def test_an_edited_plan_that_hits_something_fails_the_check_with_1(made, tmp_path):
     plan = load_plan(made[1])
     low = np.deg2rad([0.0, -10.0, 40.0, -120.0, -90.0, 0.0])
     bad = msgspec.structs.replace(plan.poses[3], joints_rad=tuple(low.tolist()), base_from_flange=None)

@@ -130,9 +130,9 @@ def next_view(
     each = view_information(mount, lens, flange, X, Y, points, noise)
     known, gains = np.tensordot(counts, each[: len(at)], 1), each[len(at) :]
     best = int(np.argmin(objective(known + gains)))
-    after_m = (
-        None if found is None else predicted_error_m(known + gains[best], objective.prior, X, distance_m)
-    )
+    after_m = None
+    if found is not None:
+        after_m = predicted_error_m(known + gains[best], objective.prior, X, distance_m)
     return NextView(mount, board, lens, at, pool[best], found, after_m)
 
 

@@ -76,7 +76,7 @@ class CellSetup:
         if arm is not None:
             robot = arm.identity
             arm.subscribe(self._stillness.add)
-        before = self.draft.robot
+        before = self.draft.robot  # known by its serial number, or by its address where it tells none
         same = before is not None and (before.serial or self.draft.host) == (robot.serial or host)
         self._found(same, host=host, robot=robot)
 

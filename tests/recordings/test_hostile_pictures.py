@@ -61,11 +61,6 @@ PICTURES: dict[str, tuple[object, Topic, str]] = {
     ),
     "raw of another size": (ONE_PIXEL, Topic.RAW_IMAGE, "is 1×1, expected 32×24"),
     "facts of another size": (ONE_PIXEL, Topic.RAW_IMAGE, "image 0 is 1×1, the camera 32×24"),
-    "raw of unknown layout": (
-        RawImage(width=WIDTH, height=HEIGHT, encoding="yuv444", data=bytes(WIDTH * HEIGHT * 3)),
-        Topic.RAW_IMAGE,
-        "encoded as 'yuv444'",
-    ),
 }
 
 

@@ -102,6 +102,6 @@ def test_bytes_after_the_last_row_of_an_image_of_a_bag_are_left_out() -> None:
     rows = bytes(range(64)) * 48
     found = raw_array(rows + b"left", "mono8", 60, 48, 64)
     np.testing.assert_array_equal(found, raw_array(rows, "mono8", 60, 48, 64))
-    for broken in ((rows + b"left", "mono8", 64, 48), (rows[:66], "yuv422", 33, 1)):
+    for broken in ((rows + b"left", "mono8", 64, 48), (rows[:66], "yuv422", 33, 1), (rows, "yuv444", 32, 32)):
         with pytest.raises(ImageError):
             raw_array(*broken)

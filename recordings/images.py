@@ -18,6 +18,8 @@ SIDE_LIMIT_PX = 16384
 Pixels = NDArray[np.uint8 | np.uint16]
 """(height, width), or (height, width, 3) as BGR."""
 
+LFS_POINTER = b"version https://git-lfs"
+"""Beginning of what stands in a repository in place of a large file that was not fetched."""
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _JPEG_SIZES = {0xC0, 0xC1, 0xC2}
 """Baseline, extended and progressive; the other start-of-frame kinds no camera writes."""
@@ -65,7 +67,7 @@ def read_header(data: bytes) -> ImageHeader:
     elif match := re.match(rb"P5\s+(\d{1,6})\s+(\d{1,6})\s+(\d{1,5})\s", data[:64]):
         width, height, top = (int(g) for g in match.groups())
         header = ImageHeader("pgm", width, height, 1, 1 if top < 256 else 2)
-    elif data.startswith(b"version https://git-lfs"):
+    elif data.startswith(LFS_POINTER):
         raise ImageError("is a pointer of Git LFS: fetch the images with `git lfs pull`")
     else:
         raise ImageError("neither PNG, JPEG, BMP nor PGM")

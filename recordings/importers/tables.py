@@ -10,6 +10,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -17,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from recordings.files import read_beginning
+from recordings.images import LFS_POINTER
 from recordings.importers.messages import Array
 from recordings.importers.trees import IMAGE, IMAGE_SUFFIXES, POSE_SIZES, read_tree
 
@@ -121,6 +124,8 @@ def look(source: Path, poses: Path | None = None) -> Contents:
             found.images.setdefault(alike, []).append(path)
             continue
         todo = next((todo for todo, suffixes in _UNREAD.items() if path.suffix.lower() in suffixes), "")
+        if _is_pointer(path):
+            todo = "to be fetched first with `git lfs pull`"
         if todo:
             found.unread[path.name] = todo
         tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
@@ -199,6 +204,12 @@ def _files(source: Path) -> Iterator[Path]:
         below[:] = sorted(name for name in below if os.path.realpath(Path(folder, name)) not in been)
         been.update(os.path.realpath(Path(folder, name)) for name in below)
         yield from (path for name in sorted(names) if (path := Path(folder, name)).is_file())
+
+
+def _is_pointer(path: Path) -> bool:
+    with suppress(OSError):
+        return read_beginning(path, len(LFS_POINTER)) == LFS_POINTER
+    return False
 
 
 def natural(path: Path | str) -> list[Any]:

@@ -212,10 +212,13 @@ def test_a_folder_without_poses_or_images_says_what_is_there(
     (tmp_path / "packed").mkdir()
     for name in ("data.zip", "poses.xlsx"):
         (tmp_path / "packed" / name).touch()
+    lfs = "version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
+    (tmp_path / "packed" / "poses.csv").write_text(lfs)
     with raises("no-pairs") as refused:
         believe(look(tmp_path / "packed"))
-    assert all(name in refused.value.values["images"] for name in ("data.zip", "poses.xlsx"))
-    (pointer := tmp_path / "1.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    told = refused.value.values["images"]
+    assert all(name in told for name in ("data.zip", "poses.xlsx", "poses.csv"))
+    (pointer := tmp_path / "1.png").write_text(lfs)
     with raises("bad-image", image="1.png"):
         board.see_board(look(pointer), None, [pointer], lambda *_: None)
 

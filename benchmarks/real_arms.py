@@ -97,7 +97,7 @@ def _errors(views: ViewSet, board: BoardSpec | None, out: Places, rest: Places) 
         seen = views if board is None else solve_pnp(replace(views, camera=joined.camera), board)
     assert joined.arm is not None and joined.arm.result is not None and joined.arm.uncorrected is not None
     nominal = joined.arm.result.nominal_chain
-    errors = np.array([value for value, _ in joined.arm.errors.values()])[: len(nominal.link_errors)]
+    errors = np.array([error.value for error in joined.arm.stated.table])[: len(nominal.link_errors)]
     by_joints = nominal.with_errors(errors).forward(_joints(views))
     told, corrected = (mount_poses(F, views.mount) for F in (views.base_from_flange, by_joints))
     C = seen.camera_from_board

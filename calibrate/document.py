@@ -16,8 +16,6 @@ from calibrate.arm_table import FramePose
 from calibrate.boards.model import ambiguity_text
 from calibrate.files.calibration import (
     FORMAT,
-    Arm,
-    ArmErrorValue,
     Calibration,
     Lens,
     Provenance,
@@ -140,7 +138,7 @@ def _quality(
     loaded: LoadedViews,
     intrinsics: Intrinsics | None,
 ) -> Quality:
-    noise, arm = solution.noise, solution.arm
+    noise = solution.noise
     remarks = _remarks(solution, loaded, intrinsics)
     reading = solution.session.reading.value
     return Quality(
@@ -165,15 +163,7 @@ def _quality(
         board=solution.board,
         cross_validation=solution.cross_validation,
         session=SessionReading(reading, next((r.text for r in solution.warnings if r.code == reading), "")),
-        arm=None
-        if arm is None
-        else Arm(
-            arm.detected,
-            arm.log_bayes,
-            arm.size_mm,
-            [ArmErrorValue(name, value, sigma) for name, (value, sigma) in arm.errors.items()],
-            arm.size_mrad,
-        ),
+        arm=None if solution.arm is None else solution.arm.stated,
         warnings=[remark.text for remark in remarks],
         warning_codes=[remark.code for remark in remarks],
     )

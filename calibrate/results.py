@@ -145,6 +145,29 @@ class CrossValidation:
     """Limit of `rms_mm` over `claimed_mm`; above it the stated uncertainties are too small."""
 
 
+class ArmErrorValue(msgspec.Struct, frozen=True):
+    """One error of the arm's links or of a bracket, true minus nominal, metres or radians."""
+
+    parameter: str
+    value: float
+    sigma: float
+
+
+class Arm(msgspec.Struct, frozen=True):
+    """Systematic errors of the robot: of the arm's kinematics, and of a bracket that bends."""
+
+    applied: bool
+    """True when the evidence for systematic errors of the arm is clear."""
+    log_bayes: float
+    """Log evidence for systematic errors of any size against none."""
+    size_mm: float
+    """1σ of the links' shifts; 0 where only a bracket is modelled."""
+    table: list[ArmErrorValue]
+    """Only their sum at the flange is known well, not each one."""
+    size_mrad: float = 0.0
+    """1σ of the links' turns, or of a bracket's bend; 0 in older files, whose `size_mm` is both."""
+
+
 class BoardShape(msgspec.Struct, frozen=True):
     """Shape of the board by the views, with 1σ each; see `SHAPE`."""
 

@@ -7,9 +7,10 @@ from typing import Literal
 import msgspec
 
 from calibrate.arm_table import CorrectedArm, FramePose
-from calibrate.files.calibration import Arm, Lens, SessionReading, Sigma, Views
+from calibrate.files.calibration import Lens, SessionReading, Sigma, Views
 from calibrate.files.validity import Validity
 from calibrate.results import (
+    Arm,
     BoardShape,
     Certificate,
     CrossValidation,

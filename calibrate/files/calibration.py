@@ -21,6 +21,7 @@ from calibrate.files.integrity import check_result, content_sha256, read_bounded
 from calibrate.files.touch import Touch
 from calibrate.geometry import Transform
 from calibrate.results import (
+    Arm,
     BoardShape,
     Certificate,
     CrossValidation,
@@ -100,25 +101,6 @@ class SessionReading(msgspec.Struct, frozen=True):
 
     hypothesis: str
     text: str
-
-
-class ArmErrorValue(msgspec.Struct, frozen=True):
-    """One error of the arm's links or of a bracket, true minus nominal, metres or radians."""
-
-    parameter: str
-    value: float
-    sigma: float
-
-
-class Arm(msgspec.Struct, frozen=True):
-    applied: bool
-    """True when the evidence for systematic errors of the arm is clear."""
-    log_bayes: float
-    size_mm: float
-    """1σ of the links' shifts."""
-    table: list[ArmErrorValue]
-    size_mrad: float = 0.0
-    """1σ of the links' turns; 0 in older files, whose `size_mm` is both."""
 
 
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):

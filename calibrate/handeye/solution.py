@@ -19,6 +19,7 @@ from calibrate.handeye.metrics import Observability
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.results import (
+    Arm,
     BoardShape,
     Certificate,
     CrossValidation,
@@ -111,29 +112,19 @@ class UncorrectedArm:
 
 @dataclass(frozen=True)
 class ArmErrors:
-    """Systematic errors of the robot: of the arm's kinematics, and of a bracket that bends."""
+    """Systematic errors of the robot, and what they mean for X."""
 
-    log_bayes: float
-    """Log evidence for systematic errors of any size against none."""
-    size_mm: float
-    """1σ of the links' shifts; 0 where only a bracket is modelled."""
-    size_mrad: float
-    """1σ of the links' turns, or of a bracket's bend."""
-    errors: dict[str, tuple[float, float]]
-    """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
+    stated: Arm
+    """The errors, and how clear they are."""
     uncorrected: UncorrectedArm | None = None
     """None where the arm's kinematics are not known: only the bracket is modelled."""
     result: CorrectedArm | None = None
     """None as `uncorrected`."""
 
     @property
-    def detected(self) -> bool:
-        return self.log_bayes > 3.0
-
-    @property
     def installed(self) -> UncorrectedArm | None:
         """The X to install beside the controller's flanges; None where the fit's own X serves."""
-        return self.uncorrected if self.detected else None
+        return self.uncorrected if self.stated.applied else None
 
 
 class Reading(Enum):

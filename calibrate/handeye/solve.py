@@ -74,7 +74,7 @@ from calibrate.handeye.solution import (
     camera_frames,
 )
 from calibrate.projection import intrinsics_names
-from calibrate.results import BoardShape, Certificate, HoldoutScore, Remark
+from calibrate.results import Arm, ArmErrorValue, BoardShape, Certificate, HoldoutScore, Remark
 from calibrate.views import ViewSet, array_of
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
@@ -243,16 +243,19 @@ def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: flo
         return None
     names = FLEX if fit.arm is None else (*fit.arm.chain.link_errors, *FLEX)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    errors = dict(
-        zip(names, zip(fit.estimate.state.arm_errors.tolist(), sigma.tolist(), strict=True), strict=True)
-    )
+    found = zip(names, fit.estimate.state.arm_errors.tolist(), sigma.tolist(), strict=True)
     size = fit.estimate.scales.arm_error_sigma
-    found = ArmErrors(fit.log_bayes, 0.0 if fit.arm is None else float(size[0]), float(size[3]), errors)
+    stated = Arm(
+        applied=fit.log_bayes > 3.0,  # strong evidence, by Kass and Raftery (1995)
+        log_bayes=fit.log_bayes,
+        size_mm=0.0 if fit.arm is None else float(size[0]),
+        table=[ArmErrorValue(*each) for each in found],
+        size_mrad=float(size[3]),
+    )
     if fit.arm is None:
-        return found
-    missed = held_out_elsewhere(fit, fit.arm.joints_rad) if found.detected and options.folds else None
-    uncorrected, result = arm_results(fit, fit.arm, found.detected, distance_m, missed)
-    return replace(found, uncorrected=uncorrected, result=result)
+        return ArmErrors(stated)
+    missed = held_out_elsewhere(fit, fit.arm.joints_rad) if stated.applied and options.folds else None
+    return ArmErrors(stated, *arm_results(fit, fit.arm, stated.applied, distance_m, missed))
 
 
 def _holdout(fit: CellFit) -> HoldoutScore | None:
@@ -284,8 +287,8 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
     suspects = ", ".join(f"{index + 1} (P(outlier) {p:.2f})" for index, p in solution.suspects.items())
     offered = arm is not None and arm.result is not None and arm.result.offered
     systematic = (
-        f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm, "
-        f"{arm.size_mrad if arm else 0.0:.2f} mrad in the arm's links, or a bracket that bends. "
+        f"Robot residuals follow the posture: {arm.stated.size_mm if arm else 0.0:.2f} mm, "
+        f"{arm.stated.size_mrad if arm else 0.0:.2f} mrad in the arm's links, or a bracket that bends. "
     ) + ("Use the corrected arm." if offered else "Have the arm calibrated, and stiffen the bracket.")
     said = (
         (session.reading is not Reading.AS_RECORDED, session.reading.value, explain_text(session, fit.views)),
@@ -296,7 +299,7 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
             "no-corners",
             "No corners were recorded: board poses count as exact, all error is the robot's.",
         ),
-        (arm is not None and arm.detected, "arm-systematics", systematic),
+        (arm is not None and arm.stated.applied, "arm-systematics", systematic),
         (bool(fit.joints_note), "joints", fit.joints_note),
         (
             bool(fit.arm_failure),

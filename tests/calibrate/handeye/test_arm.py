@@ -59,8 +59,8 @@ def test_table_errors_are_found_and_coverage_comes_back():
     for _ in range(2):
         worn = worn_cell(rng, 0.4)
         found = solve_views(worn.views, QUICK)
-        assert found.arm.log_bayes > 3 and found.arm.detected
-        assert 0.1 < found.arm.size_mm < 1.0
+        assert found.arm.stated.log_bayes > 3 and found.arm.stated.applied
+        assert 0.1 < found.arm.stated.size_mm < 1.0
         assert "arm-systematics" in {remark.code for remark in found.warnings}
         assert found.rejected == ()
         held["with"] += inside(found, worn.X)
@@ -76,7 +76,7 @@ def test_a_good_arm_is_not_accused_and_costs_little():
     for _ in range(2):
         worn = worn_cell(rng, 0.0)
         found = solve_views(worn.views, QUICK)
-        assert found.arm.log_bayes < 3 and not found.arm.detected
+        assert found.arm.stated.log_bayes < 3 and not found.arm.stated.applied
         assert found.arm.result.refused == "no-evidence"
         assert "arm-systematics" not in {remark.code for remark in found.warnings}
         plain_m = np.sqrt(np.trace(without_arm(worn.views).covariance[:3, :3]))
@@ -87,7 +87,7 @@ def test_a_good_arm_is_not_accused_and_costs_little():
 def test_without_joints_the_poses_serve():
     worn = worn_cell(np.random.default_rng(0), 0.4)
     found = solve_views(without_joints(worn.views), QUICK)
-    assert found.arm.detected and found.arm.result.refused == "no-joints"
+    assert found.arm.stated.applied and found.arm.result.refused == "no-joints"
     assert inside(found, worn.X)
 
 
@@ -183,7 +183,7 @@ def test_an_arm_nobody_described_is_honest_and_better_by_its_joints(name, mount)
         solved = [solve_views(views, QUICK) for views in (cell.views, without_joints(cell.views))]
         covered.append(inside(solved[0], cell.X))
         errors.append([error_mm_deg(solution.matrix, cell.X)[0] for solution in solved])
-        assert solved[0].arm.detected and solved[0].arm.uncorrected is not None
+        assert solved[0].arm.stated.applied and solved[0].arm.uncorrected is not None
     with_joints, without = np.sqrt(np.mean(np.square(errors), axis=0))
     assert all(covered) and with_joints < 0.8 * without
 
@@ -194,7 +194,7 @@ def test_wrong_poses_cost_no_more_than_their_views():
     flange = cell.views.base_from_flange
     flange[[4, 11]], flange[7, 0, 3] = flange[[11, 4]], 10.0
     spoilt, good = with_flange(cell.views, flange), [i for i in range(25) if i not in (4, 7, 11)]
-    assert inside(solution := solve_views(spoilt, QUICK), cell.X) and solution.arm.detected
+    assert inside(solution := solve_views(spoilt, QUICK), cell.X) and solution.arm.stated.applied
     spoilt, sound = (solve_views(without_joints(views), QUICK) for views in (spoilt, cell.views.select(good)))
     assert spoilt.sigma_translation_m == pytest.approx(sound.sigma_translation_m, rel=0.1)
     assert spoilt.posterior.flange_extent_m == pytest.approx(sound.posterior.flange_extent_m, rel=1e-3)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
-
 from calibrate.files.install import installed_calibration
 from station.cell.pose_plan import Plan
 from station.cell.status import CHECK_VIEWS, SessionStatus, StationState, StationStatus
 from station.operate.motion import PREPARE_S, Approve, prepared_motion
 from station.protocol.client import Client
-from station.protocol.verbs import Freedrive, GetPlan, LoadPlan, MakePlan, Prepare, Purpose
+from station.protocol.verbs import Freedrive, LoadPlan, MakePlan, Prepare, Purpose
 
 SEED = 0
 
@@ -27,27 +25,25 @@ async def start_drift_check(
 
     `plan`: of the poses to capture, so that its hash is known before; None: `poses` new ones.
 
-    The loaded plan, or none, stands again where nothing was started, but no earlier drift check's: it would
-    be offered as a capture. The question names one never run.
+    What was loaded stands again where nothing was started. The question names a plan never run.
     Raises CalibrationError before anything is planned when nothing is installed below the daemon's root.
     """
     installed_calibration(link.root, link.camera)
     if status.robot.by_hand:
         await link.call(Freedrive(True, check=True))
         return True
-    before, lost = (await link.call(GetPlan())).plan, _never_run(status)
+    lost = _never_run(status)
     warnings = (f"the loaded plan of {lost} poses, never run, is replaced",) if lost else ()
     if plan is None:
         await link.call(MakePlan(poses, SEED, lens_known=True), timeout_s=PREPARE_S)
     else:
         await link.call(LoadPlan(plan))
-    made, started = (await link.call(GetPlan())).plan, False
+    started = False
     try:
         started = await prepared_motion(link, Prepare(Purpose.DRIFT_CHECK), approve, warnings=warnings)
     finally:
-        if made is not None and not started:
-            before = None if status.session.check else before
-            await link.call(LoadPlan(before or msgspec.structs.replace(made, poses=())))
+        if not started:
+            await link.call(LoadPlan())
     return started
 
 

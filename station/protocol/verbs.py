@@ -200,7 +200,8 @@ class LoadPlan(Verb[Done], frozen=True):
     states = _LOADING
     moves = True
     spoken = "another plan"
-    plan: Plan
+    plan: Plan | None = None
+    """None: the one that the last loaded one replaced, with what became of its poses."""
 
 
 class MakePlan(Verb[Done], frozen=True):

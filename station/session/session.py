@@ -20,7 +20,7 @@ from station.cell.errors import RefusedError, RobotError, StationError
 from station.cell.layout import approval_sha256
 from station.cell.pose_plan import Plan
 from station.cell.session_folder import interrupted_session
-from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
+from station.cell.status import LeaseStatus, MotionPreview, SessionStatus, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import fresh
 from station.devices.cell import Cell
@@ -75,6 +75,8 @@ class Session:
         self._run: asyncio.Task[None] | None = None
         self._stops = 0
         """Number of STOPs: an acknowledgement is not of one that came after it was asked for."""
+        self._replaced: tuple[PoseQueue | None, SessionStatus] | None = None
+        """What the loaded plan replaced."""
         self._ending = False
         """The daemon ends: nobody gets or keeps control."""
         self._tasks: list[asyncio.Task[None]] = []
@@ -310,10 +312,15 @@ class Session:
         how = "The terminal of {} does not answer." if silent else "{} released control."
         await self.lease_lost(client_id, how)
 
-    def load_plan(self, client_id: int, plan: Plan) -> None:
+    def load_plan(self, client_id: int, plan: Plan | None) -> None:
         self.permit(verbs.LoadPlan, client_id)
         self._require_no_session()
-        self._replace_plan(plan)
+        if plan is not None:
+            self._replace_plan(plan)
+        elif self._replaced is not None:
+            self.approvals.void()
+            (self.context.queue, session), self._replaced = self._replaced, None
+            self.store.update(session=session)
 
     async def make_plan(self, client_id: int, wanted: verbs.MakePlan) -> None:
         """Make a plan in the worker and load it. ConfigError and LimitError say what prevents it."""
@@ -342,6 +349,7 @@ class Session:
 
     def _replace_plan(self, plan: Plan) -> None:
         self.approvals.void()
+        self._replaced = self.context.queue, self.store.status.session
         self.context.queue = PoseQueue(plan)
         self.context.forget_session()
         self.context.show_poses()

@@ -57,12 +57,7 @@ async def test_it_is_loaded_again_where_nothing_was_started(
     else:
         with pytest.raises(RefusedError):
             await start_drift_check(link, loaded(attempt), approves)
-    assert link.asked[-1] == verbs.LoadPlan(LOADED)
-
-
-async def test_the_poses_of_an_earlier_drift_check_are_not_offered_as_a_capture(link: FakeLink) -> None:
-    assert not await start_drift_check(link, during("check", "r.mcap"), AsyncMock(return_value=False))
-    assert link.asked[-1] == verbs.LoadPlan(msgspec.structs.replace(LOADED, poses=()))
+    assert link.asked[-1] == verbs.LoadPlan()
 
 
 async def test_a_plan_whose_hash_was_approved_before_is_captured_as_it_is(link: FakeLink) -> None:

@@ -287,3 +287,16 @@ async def test_no_modelled_point_is_driven_faster_than_the_cap_nor_a_joint_than_
         assert asked == pytest.approx((checked.joint_speed_rad_s, checked.joint_acceleration_rad_s2))
         assert speed_rad_s <= joint_speed_rad_s
         assert checked.top_speed_m_s <= SPEED_CAP_M_S
+
+
+async def test_what_a_plan_replaced_stands_again_as_it_was(rig: Rig) -> None:
+    await rig.go_until(S.IDLE)
+    session, plan = rig.session.store.status.session, rig.session.context.loaded().plan
+    rig.session.load_plan(1, msgspec.structs.replace(plan, poses=plan.poses[:2]))
+    offer = await rig.session.prepare(1, Purpose.DRIFT_CHECK)
+    assert rig.session.store.status.session.recording == ""
+    rig.session.load_plan(1, None)
+    assert rig.session.store.status.session == session
+    assert rig.session.context.loaded().plan == plan and rig.session.context.loaded().done == POSES
+    with raises("approval-used"):
+        await rig.session.go(1, offer.token)

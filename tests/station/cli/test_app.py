@@ -61,7 +61,7 @@ class Shell:
 @pytest.fixture
 def shell(tmp_path: Path) -> Iterator[Shell]:
     """Beside a simulated daemon, faster than real time."""
-    served = ["--simulate", "--root", str(tmp_path), "--time-scale", "4"]
+    served = ["--simulate", "--scene", "paper-binned", "--root", str(tmp_path), "--time-scale", "4"]
     with own_daemon(served, tmp_path / "daemon.log") as socket:
         yield Shell(socket)
 

@@ -30,7 +30,7 @@ from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
 from recordings.importers.folder import Imported
 from recordings.importers.messages import ImageMessage, Progress
 from recordings.importers.selection import Selection, Wanted, select
-from recordings.importers.stops import Standstill, StandstillLimits, find_stops, proposed_limits
+from recordings.importers.stops import Standstill, StandstillLimits, StopFinder
 from recordings.schema.messages import CameraModel, Image, Joints, Matrix4, RobotState, Stamps, Vector6, View
 from recordings.schema.viewing import matrix_of
 from recordings.writer import RecordingWriter, derived_recording
@@ -61,7 +61,8 @@ def import_bag(
         speeds = None
         if joints is not None and joints.speeds_rad_s is not None:
             speeds = joints.stamps_ns, np.abs(joints.speeds_rad_s).max(axis=1)
-        stops, passed = find_stops(chosen.track, images_ns, speeds, limits, pair_within_s)
+        finder = StopFinder(chosen.track, images_ns, speeds, pair_within_s)
+        stops, passed = finder.stops(limits)
         why = ", ".join(f"{count} {reason}" for reason, count in passed.items() if count)
         bound_ms = 1e3 * max((stop.bound_s for stop in stops), default=0.0)
         known = (described and described.camera) or chosen.camera
@@ -74,7 +75,7 @@ def import_bag(
             "not used": (", ".join(bag.others) or "nothing", ""),
         }
         if output is None:
-            if wider := proposed_limits(chosen.track, images_ns, speeds, limits, pair_within_s):
+            if wider := finder.wider(limits):
                 still_mm, still_deg = 1e3 * wider[0].position_m, np.degrees(wider[0].rotation_rad)
                 flags = f"--still-mm {still_mm:.2g} --still-deg {still_deg:.2g}"
                 facts["wider"] = flags, f"gives {wider[1]} stops"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,44 +50,93 @@ class Standstill:
     """Time between the image and the arm's nearest report."""
 
 
-def find_stops(
-    track: Track,
-    images_ns: NDArray[np.int64],
-    speeds: tuple[NDArray[np.int64], Array] | None,
-    limits: StandstillLimits,
-    pair_within_s: float,
-) -> tuple[list[Standstill], dict[str, int]]:
-    """(one image of each stop, how many images were passed over for which reason).
+@dataclass(frozen=True, eq=False)
+class StopFinder:
+    """Finds the stops of an arm, and the image to take of each."""
 
-    `speeds`: stamps and the fastest joint's speed. Of several images of one stop the last one is taken: the
-    arm has settled longest.
-    """
-    stamps = track.stamps_ns
-    period_s = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else np.inf
-    window_s = max(WINDOW_S, LEAST_SAMPLES * period_s)
-    passed = {"moving": 0, "no pose near": 0, "same stop": 0}
-    stops: list[Standstill] = []
-    moved = True
-    for place in np.argsort(images_ns, kind="stable").tolist():
-        time_ns = int(images_ns[place])
-        bound_s = track.gap_s(time_ns)
-        if bound_s > pair_within_s:
-            passed["no pose near"] += 1
-            continue
-        still = _stillness(track, stamps, speeds, time_ns, window_s)
-        if not (limits.every_image or _motion(still, limits) <= 1.0):
-            passed["moving"] += 1
-            moved = True
-            continue
-        T = track.at(np.array([time_ns]))[0]
-        stop = Standstill(place, time_ns, T, still, bound_s)
-        if stops and not (moved or limits.every_image) and _same(stops[-1].base_from_flange, T):
-            passed["same stop"] += 1
-            stops[-1] = stop
-        else:
-            stops.append(stop)
-        moved = False
-    return stops, passed
+    track: Track
+    images_ns: NDArray[np.int64]
+    speeds: tuple[NDArray[np.int64], Array] | None
+    """Stamps and the fastest joint's speed, rad/s; None: nobody tells it."""
+    pair_within_s: float
+    """Longest time from an image to the arm's nearest report."""
+
+    def stops(self, limits: StandstillLimits) -> tuple[list[Standstill], dict[str, int]]:
+        """(one image of each stop, how many images were passed over for which reason).
+
+        Of several images of one stop the last one is taken: the arm has settled longest.
+        """
+        passed = {"moving": 0, "no pose near": 0, "same stop": 0}
+        stops: list[Standstill] = []
+        moved = True
+        for place in np.argsort(self.images_ns, kind="stable").tolist():
+            time_ns = int(self.images_ns[place])
+            bound_s = self.track.gap_s(time_ns)
+            if bound_s > self.pair_within_s:
+                passed["no pose near"] += 1
+                continue
+            still = self._stillness(time_ns)
+            if not (limits.every_image or _motion(still, limits) <= 1.0):
+                passed["moving"] += 1
+                moved = True
+                continue
+            T = self.track.at(np.array([time_ns]))[0]
+            stop = Standstill(place, time_ns, T, still, bound_s)
+            if stops and not (moved or limits.every_image) and _same(stops[-1].base_from_flange, T):
+                passed["same stop"] += 1
+                stops[-1] = stop
+            else:
+                stops.append(stop)
+            moved = False
+        return stops, passed
+
+    def wider(self, limits: StandstillLimits) -> tuple[StandstillLimits, int] | None:
+        """Limits by which this arm stands more often, and the stops they give; None: none do.
+
+        An arm at rest reports with about the same noise everywhere, and one that moves with far more: the
+        widest gap between images, by the logarithm of their motion, lies between the two.
+        """
+        views, _ = self.stops(replace(limits, every_image=True))
+        motion = np.sort([_motion(view.stillness, limits) for view in views])
+        motion = motion[np.isfinite(motion) & (motion > 0)]
+        if len(motion) < 3:
+            return None
+        widest = int(np.argmax(np.diff(np.log(motion)))) if motion[-1] > 2 * motion[0] else len(motion) - 1
+        factor = float(f"{1.3 * motion[widest]:.1g}")
+        wider = replace(
+            limits, position_m=factor * limits.position_m, rotation_rad=factor * limits.rotation_rad
+        )
+        now, then = (len(self.stops(each)[0]) for each in (limits, wider))
+        return (wider, then) if factor > 1 and then > now else None
+
+    def _stillness(self, time_ns: int) -> Stillness | None:
+        """The motion in the window before a time; None where too few reports tell."""
+        stamps, window_s = self._stamps_ns, self._window_s
+        first, last = np.searchsorted(stamps, [time_ns - window_s * 1e9, time_ns + 1])
+        window = stamps[first:last]
+        if len(window) < LEAST_SAMPLES or np.diff(window).max() > window_s * 1e9 / 3:
+            return None
+        position_m, rotation_rad = scatter(self.track.at(window))
+        fastest = 0.0
+        if self.speeds is not None:
+            a, b = np.searchsorted(self.speeds[0], [time_ns - window_s * 1e9, time_ns + 1])
+            fastest = float(self.speeds[1][a:b].max(initial=0.0))
+        return Stillness(
+            window_s=float(window[-1] - window[0]) / 1e9,
+            max_joint_speed_rad_s=fastest,
+            position_scatter_m=position_m,
+            rotation_scatter_rad=rotation_rad,
+        )
+
+    @cached_property
+    def _stamps_ns(self) -> NDArray[np.int64]:
+        return self.track.stamps_ns
+
+    @cached_property
+    def _window_s(self) -> float:
+        """The station's window, longer where the arm reports so rarely."""
+        period_s = float(np.median(np.diff(self._stamps_ns))) / 1e9 if len(self._stamps_ns) > 1 else np.inf
+        return max(WINDOW_S, LEAST_SAMPLES * period_s)
 
 
 def _motion(still: Stillness | None, limits: StandstillLimits) -> float:
@@ -95,56 +145,6 @@ def _motion(still: Stillness | None, limits: StandstillLimits) -> float:
         return np.inf
     moved = np.array([still.position_scatter_m, still.rotation_scatter_rad])
     return float(np.max(moved / np.maximum([limits.position_m, limits.rotation_rad], _LEAST)))
-
-
-def proposed_limits(
-    track: Track,
-    images_ns: NDArray[np.int64],
-    speeds: tuple[NDArray[np.int64], Array] | None,
-    limits: StandstillLimits,
-    pair_within_s: float,
-) -> tuple[StandstillLimits, int] | None:
-    """Limits by which this arm stands more often, and the stops they give; None: none do.
-
-    An arm at rest reports with about the same noise everywhere, and one that moves with far more: the widest
-    gap between images, by the logarithm of their motion, lies between the two.
-    """
-    views, _ = find_stops(track, images_ns, speeds, replace(limits, every_image=True), pair_within_s)
-    motion = np.sort([_motion(view.stillness, limits) for view in views])
-    motion = motion[np.isfinite(motion) & (motion > 0)]
-    if len(motion) < 3:
-        return None
-    widest = int(np.argmax(np.diff(np.log(motion)))) if motion[-1] > 2 * motion[0] else len(motion) - 1
-    factor = float(f"{1.3 * motion[widest]:.1g}")
-    wider = replace(limits, position_m=factor * limits.position_m, rotation_rad=factor * limits.rotation_rad)
-    now, then = (
-        len(find_stops(track, images_ns, speeds, each, pair_within_s)[0]) for each in (limits, wider)
-    )
-    return (wider, then) if factor > 1 and then > now else None
-
-
-def _stillness(
-    track: Track,
-    stamps: NDArray[np.int64],
-    speeds: tuple[NDArray[np.int64], Array] | None,
-    time_ns: int,
-    window_s: float,
-) -> Stillness | None:
-    first, last = np.searchsorted(stamps, [time_ns - window_s * 1e9, time_ns + 1])
-    window = stamps[first:last]
-    if len(window) < LEAST_SAMPLES or np.diff(window).max() > window_s * 1e9 / 3:
-        return None
-    position_m, rotation_rad = scatter(track.at(window))
-    fastest = 0.0
-    if speeds is not None:
-        a, b = np.searchsorted(speeds[0], [time_ns - window_s * 1e9, time_ns + 1])
-        fastest = float(speeds[1][a:b].max(initial=0.0))
-    return Stillness(
-        window_s=float(window[-1] - window[0]) / 1e9,
-        max_joint_speed_rad_s=fastest,
-        position_scatter_m=position_m,
-        rotation_scatter_rad=rotation_rad,
-    )
 
 
 def _same(a: Array, b: Array) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from recordings.errors import ImportSourceError
 from recordings.importers.frames import FrameTree
 from recordings.importers.messages import FrameMessage
-from recordings.importers.stops import StandstillLimits, find_stops, proposed_limits
+from recordings.importers.stops import StandstillLimits, StopFinder
 
 
 def frame(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> FrameMessage:
@@ -89,12 +90,11 @@ def test_an_arm_that_drifts_slowly_does_not_stand() -> None:
         T[0, 3] = n * 10e-6 * 2 / 3
         tree.add([frame(n * 10_000_000, "base", "flange", T)])
     images = np.array([1_000_000_000, 2_000_000_000], np.int64)
-    track = tree.track("base", "flange")
-    assert find_stops(track, images, None, StandstillLimits(), 0.05)[0] == []
-    assert len(find_stops(track, images, None, StandstillLimits(position_m=0.001), 0.05)[0]) == 1
-    assert find_stops(track, images, None, StandstillLimits(0.0, 0.0), 0.05)[0] == []
+    finder, wide = StopFinder(tree.track("base", "flange"), images, None, 0.05), StandstillLimits(0.001)
+    assert finder.stops(StandstillLimits())[0] == finder.stops(StandstillLimits(0.0, 0.0))[0] == []
+    assert len(finder.stops(wide)[0]) == 1
     fast = np.array([900_000_000, 1_900_000_000], np.int64), np.array([0.0, 0.1])
-    (stop,) = find_stops(track, images, fast, StandstillLimits(position_m=0.001), 0.05)[0]
+    (stop,) = replace(finder, speeds=fast).stops(wide)[0]
     assert stop.place == 0, "a joint turned before the second image"
 
 
@@ -107,9 +107,10 @@ def test_limits_come_from_an_arm_that_reports_with_more_noise() -> None:
         T[:3, 3] = rng.normal(scale=30e-6, size=3)
         T[0, 3] += 0.05 * (stop + min(1.0, share / 100))  # moves for one second, stands for one
         tree.add([frame(n * 10_000_000, "base", "flange", T)])
-    seen = tree.track("base", "flange"), np.arange(250, 20_000, 500) * 1_000_000, None
-    assert find_stops(*seen, StandstillLimits(), 0.05)[0] == []
-    wider, stops = proposed_limits(*seen, StandstillLimits(), 0.05)
-    assert stops == len(find_stops(*seen, wider, 0.05)[0]) == 10
-    assert not proposed_limits(*seen, wider, 0.05)
-    assert len(find_stops(*seen, StandstillLimits(every_image=True), 0.05)[0]) == len(seen[1])
+    images_ns = np.arange(250, 20_000, 500) * 1_000_000
+    finder = StopFinder(tree.track("base", "flange"), images_ns, None, 0.05)
+    assert finder.stops(StandstillLimits())[0] == []
+    wider, stops = finder.wider(StandstillLimits())
+    assert stops == len(finder.stops(wider)[0]) == 10
+    assert not finder.wider(wider)
+    assert len(finder.stops(StandstillLimits(every_image=True))[0]) == len(images_ns)

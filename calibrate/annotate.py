@@ -18,7 +18,7 @@ from calibrate.boards.model import board_from_turned, board_points, looks_same_t
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, encode_calibration
 from calibrate.geometry import Array
-from calibrate.projection import project_pixels
+from calibrate.projection import project_at
 from calibrate.recorded_views import Progress, load_views
 from calibrate.views import board_in_camera
 from recordings.reader import Recording
@@ -96,7 +96,7 @@ def placed_corners(calibration: Calibration, base_from_flange: ArrayLike, seen: 
     placed = board_in_camera(calibration.mount, np.asarray(base_from_flange, float), X, B)
     turns = [placed @ board_from_turned(board, quarters) for quarters in (0, *looks_same_turns(board))]
     points = board_points(board)[seen.indices]
-    at = [project_pixels(calibration.intrinsics.model, points @ T[:3, :3].T + T[:3, 3]) for T in turns]
+    at = [project_at(calibration.intrinsics.model, T, points) for T in turns]
     return min(at, key=lambda pixels: float(np.nan_to_num(np.square(pixels - seen.pixels), nan=np.inf).sum()))
 
 

@@ -271,7 +271,7 @@ def _ink(grey: Grey, H: Array, bend: Array, spec: BoardSpec) -> tuple[float, Arr
     v, u = np.mgrid[-reach : reach : side * 1j, -reach : reach : side * 1j]
     centres = board_points(spec)[:, :2] / spec.square_m
     plane = centres[:, None, None] + np.stack([u, v], axis=-1)
-    pixels = cv2.perspectiveTransform(plane.reshape(-1, 1, 2), H).reshape(len(plane) * side, side, 2)
+    pixels = through(H, plane.reshape(-1, 2)).reshape(len(plane) * side, side, 2)
     places = (pixels + np.repeat(bend, side, axis=0)[:, None]).astype(np.float32)
     patches = cv2.remap(
         grey, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -286,8 +286,7 @@ def _ink(grey: Grey, H: Array, bend: Array, spec: BoardSpec) -> tuple[float, Arr
     share *= u * u + v * v < (1.4 * radius) ** 2  # the sheet may end beyond
     area = np.maximum(share.sum(axis=(1, 2)), 1e-9)
     offset = np.stack([(share * u).sum(axis=(1, 2)), (share * v).sum(axis=(1, 2))], axis=-1) / area[:, None]
-    middles: Any = cv2.perspectiveTransform((centres + offset).reshape(-1, 1, 2), H).reshape(-1, 2)
-    return radius, middles + bend
+    return radius, through(H, centres + offset) + bend
 
 
 def _best_order(centres: Array, spec: BoardSpec) -> Array | None:
@@ -299,11 +298,12 @@ def _best_order(centres: Array, spec: BoardSpec) -> Array | None:
     for mirrored in (grid, grid[:, ::-1]):
         for turn in turns:
             candidate = np.rot90(mirrored, turn).reshape(-1, 2)
-            H, _ = cv2.findHomography(points, candidate, 0)
-            if H is None or np.linalg.det(H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]) <= 0:
+            found: Any = cv2.findHomography(points, candidate, 0)
+            if (H := found[0]) is None or np.linalg.det(
+                H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]
+            ) <= 0:
                 continue
-            shown = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H).reshape(-1, 2)
-            miss = float(np.linalg.norm(shown - candidate, axis=1).max())
+            miss = float(np.linalg.norm(through(H, points) - candidate, axis=1).max())
             # Equal fits are the turns that look the same: keep the first, so that the answer is stable.
             if miss < best_miss * 0.9:
                 best, best_miss = candidate, miss

@@ -26,7 +26,7 @@ from calibrate.files.formatting import (
 )
 from calibrate.geometry import Array, difference
 from calibrate.job import SolvedRecording
-from calibrate.projection import intrinsics_names, intrinsics_vector, project_pixels
+from calibrate.projection import intrinsics_names, intrinsics_vector, project_at
 from calibrate.report import html
 from calibrate.views import board_in_camera
 from recordings import strict_yaml
@@ -133,8 +133,7 @@ def _placed(job: SolvedRecording, view: View) -> tuple[Array, Array, float]:
     outline = np.concatenate([np.linspace(a, b, 20) for a, b in pairwise(corners)])  # a lens bends them
 
     def shown_at(points: Array) -> Array:
-        at = project_pixels(calibration.intrinsics.model, points @ C[:3, :3].T + C[:3, 3])
-        return np.nan_to_num(at)
+        return np.nan_to_num(project_at(calibration.intrinsics.model, C, points))
 
     off = np.nan_to_num(placed_corners(calibration, view.base_from_flange, seen)) - seen.pixels
     return shown_at(outline), shown_at(board), float(np.sqrt(np.square(off).sum(axis=1).mean()))

@@ -22,7 +22,6 @@ def moved_cell(seed, mount, what, at, views=24, size=1.0):
     ("mount", "what", "size"),
     [
         ("eye-in-hand", "camera", 1.0),
-        ("eye-to-hand", "camera", 1.0),
         ("eye-to-hand", "board", 1.0),
         ("eye-in-hand", "board", 0.3),
         ("eye-in-hand", "board", 5.0),

@@ -168,10 +168,7 @@ class Session:
             await self._halt(self.context.resting, reason, "control-lost")
 
     async def _halt(self, state: StationState, reason: str, cause: str) -> None:
-        """Void the approval, end the run and stop the arm; then let the run write its data, `STOP_WAIT_S`.
-
-        At its end the run plans poses again that it did not complete.
-        """
+        """Void the approval, end the run and stop the arm; then let the run write its data, `STOP_WAIT_S`."""
         context, run = self.context, self._run
         self.approvals.void()
         context.requests = RunRequests(halt=True)

@@ -86,25 +86,16 @@ def test_offline_work_runs_from_the_wheel_alone(installed: Path, tmp_path: Path)
     assert not package.is_relative_to(ROOT)
     sample = package / "samples/paper-640.mcap"
     call(installed / "recordings", "info", sample)
-    solved = call(installed / "calibrate", "solve", sample, "-o", tmp_path / "cell.yaml", "--json")
+    out = ("-o", tmp_path / "cell.yaml", "--report", tmp_path / "cell.html")
+    solved = call(installed / "calibrate", "solve", sample, *out, "--json")
     assert json.loads(solved)["verdict"] == "pass"
     install = ("install", tmp_path / "cell.yaml", "--cell", "simulated", "--root", tmp_path / "root")
     call(installed / "calibrate", *install)
     assert (tmp_path / "root/calibrations/current").exists()
 
 
-@pytest.mark.parametrize(
-    ("program", "arguments", "extra"),
-    [
-        ("calibrate", ("solve", "{sample}", "-o", "{out}/c.yaml", "--report", "{out}/r.html"), "report"),
-        ("calibrate", ("board", "-o", "{out}/board.pdf"), "report"),
-    ],
-)
-def test_a_command_without_its_extra_says_which(
-    installed: Path, tmp_path: Path, program: str, arguments: tuple[str, ...], extra: str
-) -> None:
-    sample = next(installed.parent.rglob("samples/paper-640.mcap"))
-    filled = [word.format(sample=sample, out=tmp_path) for word in arguments]
-    done = subprocess.run([installed / program, *filled], cwd="/", capture_output=True, text=True)
+def test_a_command_without_its_extra_says_which(installed: Path, tmp_path: Path) -> None:
+    command = [installed / "calibrate", "board", "-o", tmp_path / "board.pdf"]
+    done = subprocess.run(command, cwd="/", capture_output=True, text=True)
     assert done.returncode in (1, 2) and "Traceback" not in done.stderr
-    assert f"calibration-station[{extra}]" in done.stderr
+    assert "calibration-station[report]" in done.stderr

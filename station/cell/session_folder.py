@@ -7,6 +7,7 @@ ROOT/active                           names the session that runs; still there a
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 from typing import Literal
@@ -25,6 +26,8 @@ _ACTIVE = "active"
 _NAME_ATTEMPTS = 100
 _LISTED = 200
 _LIMIT_BYTES = 1024 * 1024
+_UNDER_WAY = re.compile(rb'"state":"(moving|settling|capturing|writing)"')
+"""What earlier versions wrote of a pose that is planned, and was under way."""
 
 
 class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -95,7 +98,8 @@ def write_state(folder: Path, state: SessionState) -> None:
 def read_state(folder: Path) -> SessionState | None:
     """Read a session's state; None where it is missing or invalid."""
     try:
-        return msgspec.json.decode(read_file(folder / STATE_FILE, _LIMIT_BYTES), type=SessionState)
+        text = _UNDER_WAY.sub(b'"state":"planned"', read_file(folder / STATE_FILE, _LIMIT_BYTES))
+        return msgspec.json.decode(text, type=SessionState)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from recordings.errors import RecordingError
+from station.cell.session_folder import STATE_FILE
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Retake, Skip
 from tests.codes import raises
@@ -17,7 +18,11 @@ def under_way(rig: Rig, moves: int) -> bool:
     return rig.arm.under_way and rig.arm.log.count("move") == moves
 
 
-async def test_what_failed_and_what_was_changed_in_a_pause_is_known_after_a_crash(new_rig: NewRig) -> None:
+@pytest.mark.parametrize("written", ["skipped", "moving", "settling", "capturing", "writing"])
+async def test_what_failed_and_what_was_changed_in_a_pause_is_known_after_a_crash(
+    new_rig: NewRig, written: str
+) -> None:
+    """Also of a session of an earlier version, in which a pose was under way."""
     first = await new_rig()
     first.camera.fail = ["frame lost"] * 3
     first.arm.slow = True
@@ -28,8 +33,11 @@ async def test_what_failed_and_what_was_changed_in_a_pause_is_known_after_a_cras
     await first.pause_after_this_pose("anna")
     await first.session.edit(1, Skip(2))
     crash(first)
+    (kept,) = first.session.context.root.rglob(STATE_FILE)
+    kept.write_bytes(kept.read_bytes().replace(b'"skipped"', f'"{written}"'.encode()))
     second = await new_rig(with_plan=False)
-    assert second.pose_states == ["failed", "done", "skipped", "planned"]
+    third = written if written == "skipped" else "planned"
+    assert second.pose_states == ["failed", "done", third, "planned"]
     assert "frame lost" in second.session.store.status.session.poses[0].reason
 
 

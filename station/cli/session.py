@@ -96,7 +96,7 @@ class Attended:
         with session_progress(err, self._quiet, before) as show:
             status = await until_rest(self.client, show)
             while self._goes_on(status.cause):
-                await self._go_on()
+                await self._go_on(status)
                 status = await until_rest(self.client, show)
             if status.state is StationState.PAUSED and self._headless and status.session.captured:
                 await self.client.call(Finish())
@@ -110,14 +110,11 @@ class Attended:
         self.approved_again += unattended and late
         return unattended and late
 
-    async def _go_on(self) -> None:
+    async def _go_on(self, late: StationStatus) -> None:
         """Acknowledge and approve the poses that are left, as a person at a real cell would."""
-        late = await self.status()
         session = late.session
-        if late.state is StationState.STOPPED:
-            return  # meanwhile, by a person
         if late.state is StationState.FAULT:
-            await self.client.call(Acknowledge())
+            await self.client.call(Acknowledge(late.cause))  # of no STOP by a person meanwhile
         anew = Purpose.DRIFT_CHECK if session.check else Purpose.RUN
         purpose = Purpose.RESUME if session.name else anew
         while True:

@@ -185,6 +185,8 @@ class Acknowledge(Verb[Done], frozen=True):
 
     states = LATCHED
     control = False
+    cause: str = ""
+    """Of the state that was seen, of which alone it is; empty: of whatever stands."""
 
 
 class GetPlan(Verb[LoadedPlan], frozen=True):

@@ -97,7 +97,7 @@ class SessionDispatcher:
             case verbs.Release():
                 await self._to_the_end(session.release(client, verb.silent))
             case verbs.Acknowledge():
-                await session.acknowledge(caller.who)
+                await session.acknowledge(caller.who, verb.cause)
             case verbs.GetPlan():
                 queue = context.queue
                 return verbs.LoadedPlan(queue.plan if queue else None)

@@ -187,8 +187,8 @@ class Session:
         if (mover := self.context.cell.mover) is not None:
             await mover.stop(reason)
 
-    async def acknowledge(self, who: str) -> None:
-        """Leave `stopped` or `fault` after a person looked at the cell."""
+    async def acknowledge(self, who: str, cause: str = "") -> None:
+        """Leave `stopped` or `fault` after a person looked at the cell; `cause`: only what stands for it."""
         self._require_state(verbs.Acknowledge)
         stops = self._stops
         try:
@@ -197,7 +197,7 @@ class Session:
         except RobotError:
             resting = StationState.DISCONNECTED
         self._require_state(verbs.Acknowledge)
-        if self._stops != stops:
+        if self._stops != stops or (cause and cause != self.store.status.cause):
             raise RefusedError("stopped-again")
         self.store.enter(resting)
         self.store.event("acknowledged", f"acknowledged by {who}", who=who)
@@ -364,7 +364,9 @@ class Session:
         if self.store.state is StationState.FREE_DRIVE:
             await self.freedrive.take_back(verb.index)
             return
-        under_way = self.store.state in RUNNING and verb.index == self.store.status.session.current
+        # Not by the state: after a loss of control it is `paused` while the image is still being written.
+        busy = self.freedrive.taking or (self._run is not None and not self._run.done())
+        under_way = busy and verb.index == self.store.status.session.current
         if under_way and queue.status(verb.index).state == "planned":
             raise refused("pose-busy", verb.index)
         change = queue.retake if isinstance(verb, verbs.Retake) else queue.skip

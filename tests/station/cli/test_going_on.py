@@ -15,6 +15,7 @@ from station.devices.news import Delay
 from station.protocol.verbs import Purpose
 from station.server.connections import ClientServer
 from station.server.dispatch import SessionDispatcher
+from tests.codes import raises
 from tests.station.session_rig import POSES, Rig, sealed
 
 LATE = [StaleStateError(delay) for delay in Delay]
@@ -98,14 +99,17 @@ async def test_nothing_but_lateness_is_gone_on_after(
 async def test_a_persons_stop_is_not_acknowledged(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig.arm.move, go_on = first_fails(rig.arm.move, LATE[:1]), Attended._go_on
+    """Not even the one that comes just before the acknowledgement."""
+    rig.arm.move = first_fails(rig.arm.move, LATE[:1])
+    acknowledge = rig.session.acknowledge
 
-    async def stopped_meanwhile(shell: Attended) -> None:
+    async def stopped_just_before(*asked: Any) -> None:
         await rig.session.stop("ben")
-        await go_on(shell)
+        await acknowledge(*asked)
 
-    monkeypatch.setattr(Attended, "_go_on", stopped_meanwhile)
-    await carried_out(rig, tmp_path)
+    monkeypatch.setattr(rig.session, "acknowledge", stopped_just_before)
+    with raises("stopped-again"):
+        await carried_out(rig, tmp_path)
     assert rig.state is S.STOPPED and not rig.told("acknowledged")
 
 

@@ -18,7 +18,7 @@ from station.cell.pose_plan import Plan
 from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus
 from station.cell.status import StationState as S
 from station.protocol.client import Client
-from station.protocol.verbs import MakePlan, Purpose, Skip
+from station.protocol.verbs import MakePlan, Purpose, Retake, Skip
 from station.server.connections import ClientServer
 from station.server.dispatch import SessionDispatcher
 from station.session import device_connector, supervisor
@@ -211,6 +211,8 @@ async def test_finish_waits_for_what_is_being_written(rig: Rig, held_disk: HeldD
     losing = asyncio.ensure_future(rig.session.lease_lost(1))
     await rig.until(S.PAUSED)
     rig.session.take_lease(2, "bert")
+    with raises("pose-busy"):  # else it would be forgotten when the image is on the disk
+        await rig.session.edit(2, Retake(0))
     finishing = asyncio.ensure_future(rig.session.finish(2))
     await asyncio.sleep(0.02)
     assert not finishing.done()

@@ -146,6 +146,7 @@ class CellSetup:
             return False
         if self.guide is None:
             self.guide = HandGuide(self.arm.latest, self._stillness)
+            self.arm.guided = True  # also: from the first view on no other TCP offset is taken
         arm, guide, blank = self.arm, self.guide, CameraModel(draft.width, draft.height)
         cell = (draft.mount, draft.board, blank, False)
         self.guidance = await guide.look(cell, draft.views, image, seen)

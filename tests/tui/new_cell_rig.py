@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from multiprocessing import resource_tracker
+
 from station.cell.config import CameraChoice, CameraConfig
 from station.devices.base import Camera
 from station.devices.guided import RealHardware
@@ -16,6 +18,7 @@ class SimulatedHardware(RealHardware):
 
     def __init__(self, truth: CellTruth, host: str) -> None:
         self.truth, self.host = truth, host
+        resource_tracker.ensure_running()  # a screen, which has no stderr to pass on, cannot start it
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
         return (CAMERA,)

@@ -99,6 +99,7 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path, monkeypatch: p
             await person.press("enter")
             await person.until_step(CellStep.VIEWS)
             await until(pilot, lambda: len(app.setup.draft.views) == 1)
+            assert app.setup.arm.guided, "a view relies on the tool as it is known now"
             await pilot.press("o")
             await until(pilot, lambda: app.live_page and b'"outline":[[' in app.live_page._body)
             for joints in guided_joints(truth)[1:]:  # it stands at the first one

@@ -5,13 +5,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
-import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing import get_context, parent_process
-from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
 from station.cell.errors import StationError
@@ -21,7 +19,6 @@ log = logging.getLogger(__name__)
 
 R = TypeVar("R")
 START_S = 60.0
-REAP_S = 5.0
 
 
 class WorkerError(StationError):
@@ -87,11 +84,10 @@ class Workers:
         if self._pool is pool:
             self._pool = None
         processes = list((pool._processes or {}).values())
+        # No waiting: the event loop sends the arm's heartbeat. The pool's own thread sees them end.
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.kill()
-        # In a thread: the event loop sends the arm's heartbeat and must not wait for a process to end.
-        threading.Thread(target=_reap, args=(processes,), name="worker reaper", daemon=True).start()
 
 
 def live_with_parent() -> None:
@@ -99,8 +95,3 @@ def live_with_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # at a terminal it reaches all: the parent ends its workers
     if (parent := parent_process()) is not None and parent.pid is not None:
         die_with_parent(parent.pid)
-
-
-def _reap(processes: list[BaseProcess]) -> None:
-    for process in processes:
-        process.join(REAP_S)

@@ -147,11 +147,7 @@ class ClientServer:
         return None
 
     async def _serve(self, link: socket.socket, peer: Peer) -> None:
-        loop = asyncio.get_running_loop()
-        reader = asyncio.StreamReader(limit=LINE_LIMIT_BYTES)
-        protocol = asyncio.StreamReaderProtocol(reader)
-        transport, _ = await loop.connect_accepted_socket(lambda: protocol, link)
-        writer = asyncio.StreamWriter(transport, protocol, reader, loop)
+        reader, writer = await asyncio.open_unix_connection(sock=link, limit=LINE_LIMIT_BYTES)
         connection = _Connection(peer, reader, writer, self._handler, self.publish)
         self._connections.add(connection)
         try:
@@ -227,7 +223,7 @@ class _Connection:
             status = self._publish()  # before the reply, so that the client never sees an older status
             self.reply(Answer(request.id, True, result))
             if request.verb == "watch" and not self.watching:
-                self.send(msgspec.json.encode(Answer(status=status)) + b"\n")
+                self.reply(Answer(status=status))
                 self.watching = True
         except CodedError as error:
             self.refuse(request.id, error)
@@ -268,9 +264,7 @@ class _Connection:
 
     def drop(self, why: str) -> None:
         log.warning("client %d (pid %d) is dropped: %s", self.peer.client_id, self.peer.pid, why)
-        with contextlib.suppress(OSError):
-            dropped = Answer.refused(0, RefusedError("dropped", why=why))
-            self._writer.write(msgspec.json.encode(dropped) + b"\n")
+        self.refuse(0, RefusedError("dropped", why=why))
         self.hang_up()
 
     def hang_up(self) -> None:

@@ -8,12 +8,14 @@ import subprocess
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO, Self
 
 from recordings.files import open_regular
+from station.cell.errors import StationError
 
 STOP_TIMEOUT_S = 3.0
 END_TIMEOUT_S = 0.5
+LOG_LIMIT_BYTES = 1_000_000
 
 
 class ChildProcess:
@@ -46,15 +48,14 @@ class ChildProcess:
 
 
 def start_child(
-    command: list[str], timeout_s: float, log: Path | None, stdin: int = subprocess.PIPE
-) -> tuple[subprocess.Popen[bytes], str]:
-    """Start a child; return it, and why it was not ready and was ended ("": it is ready).
+    program: str, command: list[str], timeout_s: float, log: Path | None, stdin: int = subprocess.PIPE
+) -> ChildProcess:
+    """Start a child, and return once it writes a line with `"ready": true`; else it is ended: StationError.
 
-    It is ready once it writes a line with `"ready": true`. It has a session of its own: Ctrl-C in this
-    terminal is not meant for it. log: where its standard error goes.
+    It has a session of its own: Ctrl-C in this terminal is not meant for it. program: its name for people.
+    log: where its standard error goes.
     """
-    kept = None if log is None else open_regular(log, os.O_RDWR | os.O_APPEND | os.O_CREAT)
-    with tempfile.TemporaryFile() if kept is None else os.fdopen(kept, "a+b") as stderr:
+    with tempfile.TemporaryFile() if log is None else open_log(log) as stderr:
         said_before = stderr.seek(0, os.SEEK_END)
         child = subprocess.Popen(
             command, stdin=stdin, stdout=subprocess.PIPE, stderr=stderr, start_new_session=True
@@ -64,7 +65,7 @@ def start_child(
             select.select([child.stdout], [], [], timeout_s)[0]
             and b'"ready": true' in child.stdout.readline()
         ):
-            return child, ""
+            return ChildProcess(child)
         try:
             child.wait(END_TIMEOUT_S)  # it may be ending already
         except subprocess.TimeoutExpired:
@@ -72,4 +73,14 @@ def start_child(
         child.communicate()
         stderr.seek(said_before)
         words = stderr.read().decode(errors="replace").strip()
-    return child, words or f"no ready line within {timeout_s:g} s"
+    said = "\n".join(words.splitlines()[-3:]) or f"no ready line within {timeout_s:g} s"
+    raise StationError("not-started", program=program, log=log or "what it said", tail=said)
+
+
+def open_log(path: Path) -> BinaryIO:
+    """Open a log for appending; one that grew too long is renamed, replacing the last one renamed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileNotFoundError):
+        if path.stat().st_size > LOG_LIMIT_BYTES:
+            path.replace(path.with_suffix(".log.1"))
+    return os.fdopen(open_regular(path, os.O_RDWR | os.O_APPEND | os.O_CREAT), "a+b")

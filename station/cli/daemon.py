@@ -45,13 +45,11 @@ def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
     """
     if answers(socket):
         return socket
-    root = state_root()
     config = config or find_config()
     what = ["--simulate"] if config is None else ["--config", str(config)]
     cell = "a SIMULATED cell (none set up: `station new`)" if config is None else f"the cell of {config}"
     print(f"Starting {cell} …", file=sys.stderr)
-    root.mkdir(parents=True, exist_ok=True)
-    _started([*what, "--socket", str(socket)], root / "daemon.log", subprocess.DEVNULL)
+    _started([*what, "--socket", str(socket)], state_root() / "daemon.log", subprocess.DEVNULL)
     return socket
 
 
@@ -63,22 +61,17 @@ def own_daemon(arguments: Sequence[str], log: Path) -> Iterator[Path]:
     """
     with tempfile.TemporaryDirectory(prefix="station-") as place:
         socket = Path(place) / "control.sock"
-        child = ChildProcess(
-            _started([*arguments, "--socket", str(socket), "--end-with-stdin"], log, subprocess.PIPE)
-        )
+        child = _started([*arguments, "--socket", str(socket), "--end-with-stdin"], log, subprocess.PIPE)
         try:
             yield socket
         finally:
             child.stop(END_S)
 
 
-def _started(arguments: Sequence[str], log: Path, stdin: int) -> subprocess.Popen[bytes]:
+def _started(arguments: Sequence[str], log: Path, stdin: int) -> ChildProcess:
     """Start a daemon and wait until it serves. StationError with the end of what it said."""
     command = [sys.executable, "-m", "station.cli", "serve", *arguments]
-    child, problem = start_child(command, READY_S, log, stdin)
-    if problem:
-        raise StationError("not-started", log=log, tail="\n".join(problem.splitlines()[-3:]))
-    return child
+    return start_child("daemon", command, READY_S, log, stdin)
 
 
 def tell_what_goes_on(socket: Path) -> None:

@@ -93,7 +93,6 @@ def demo_command(
         err.print(f"SIMULATED cell, seed {seed}: takes about a minute, nothing real moves.", style="dim")
     # A worn arm is worth poses that tell its table from the rest.
     plan = MakePlan(poses, seed, aim="arm" if noise == "high" else "camera")
-    folder.mkdir(parents=True, exist_ok=True)
     served = ["--simulate", "--root", str(folder), *arguments]
     with own_daemon(served, folder / "daemon.log") as socket:
         outcome, approved_again = asyncio.run(_captured(socket, plan, quiet))

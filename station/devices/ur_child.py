@@ -15,12 +15,12 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import TypeVar
 
 import msgspec
 
 from recordings.errors import ErrorData
-from recordings.files import open_regular
+from station.cell.child import open_log
 from station.cell.errors import RobotError, StaleStateError
 from station.devices.news import Delay
 from station.devices.ur_moves import STOP_RAD_S2
@@ -35,7 +35,6 @@ HEARD_NS = 50_000_000
 ACKNOWLEDGE_S = 1.0
 END_S = 1.0
 REAP_S = 2.0
-LOG_LIMIT_BYTES = 1_000_000
 KEPT = 64
 """Number of watchdog resets that are remembered: more than a second of them."""
 
@@ -97,7 +96,7 @@ class ControlChild:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command = [sys.executable, "-m", "station.devices.ur_control", path, host, str(theirs.fileno())]
         try:
-            with theirs, _log(log_path) as log:
+            with theirs, open_log(log_path) as log:
                 process = subprocess.Popen(
                     [*command, str(os.getpid())],
                     stdin=subprocess.DEVNULL,
@@ -282,12 +281,3 @@ class ControlChild:
 def _resolve(waiter: asyncio.Future[T], result: T) -> None:
     if not waiter.done():
         waiter.set_result(result)
-
-
-def _log(path: Path) -> BinaryIO:
-    """Open a log for appending; one that grew too long is renamed, replacing the last one renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with contextlib.suppress(FileNotFoundError):
-        if path.stat().st_size > LOG_LIMIT_BYTES:
-            path.replace(path.with_suffix(".log.1"))
-    return os.fdopen(open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab")

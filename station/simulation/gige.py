@@ -61,7 +61,7 @@ class GigeCamera:
             address.encode(), serial.encode(), str(DESCRIPTION).encode()
         )
         if not self._server or not self._lib.arv_gv_fake_camera_is_running(self._server):
-            raise CameraError("simulation-not-started", device=address, reason="it does not run")
+            raise CameraError("no-simulation", device=f"GigE camera at {address}", reason="it does not run")
         self._camera = self._lib.arv_gv_fake_camera_get_fake_camera(self._server)
         self._describe(width, height, serial)
         self._lib.arv_fake_camera_set_trigger_frequency(self._camera, 1000.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import random
+import os
 import socket
 import subprocess
 import sys
@@ -18,9 +18,6 @@ from station.simulation.netns import is_isolated
 Json = dict[str, Any]
 """Message between parent and child: a JSON object in one line."""
 ADMIN_PORT = 29990
-ATTEMPTS = 5
-ADDRESS_TAKEN = 1
-"""Exit code of a controller that cannot listen on its address."""
 CONTROLLER_TIMEOUT_S, GIGE_TIMEOUT_S, ANSWER_S = 15.0, 30.0, 5.0
 
 
@@ -85,36 +82,29 @@ def start_controller(
 ) -> SimulatedController:
     """Start a controller and wait until all its ports listen; blocking, so call it outside an event loop.
 
-    It gets a random free 127.x.y.z. log: file for its standard error. options: further arguments of the
-    command line. module: another program with the same command line. Raises RobotError with the child's last
-    output.
+    It gets a random 127.x.y.z. log: file for its standard error. options: further arguments of the
+    command line. module: another program with the same command line. Raises StationError with the child's
+    last output.
     """
-    command = [sys.executable, "-m", module, "--model", model, "--die-with-parent"]
+    first, second, third = os.urandom(3)  # of 16 million addresses
+    host = f"127.{first % 254 + 1}.{second}.{third % 254 + 1}"
+    command = [sys.executable, "-m", module, "--model", model, "--host", host, "--die-with-parent"]
     command += ["--time-scale", str(time_scale), *options]
     if truth is not None:
         command += ["--truth", str(truth)]
-    for attempt in range(ATTEMPTS, 0, -1):
-        host = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
-        child, problem = start_child([*command, "--host", host], CONTROLLER_TIMEOUT_S, log)
-        if not problem:
-            give_own_priority(child.pid)
-            return SimulatedController(host, child)
-        if child.returncode != ADDRESS_TAKEN or attempt == 1:
-            break
-    raise RobotError("simulation-not-started", device=model, reason=problem, exit_code=child.returncode)
+    process = start_child(f"simulated {model}", command, CONTROLLER_TIMEOUT_S, log).process
+    give_own_priority(process.pid)
+    return SimulatedController(host, process)
 
 
 def start_gige(controller_host: str, truth: Path, serial: str, log: Path | None = None) -> ChildProcess:
     """Start the camera on 127.0.0.1 and wait until it listens; blocking, so call it outside an event loop.
 
-    log: where its standard error goes.
+    log: where its standard error goes. Raises StationError with the child's last output.
 
     CameraError where there is any network interface but `lo`: GigE discovery broadcasts on all of them.
     """
     if not is_isolated():
         raise CameraError("not-isolated")
     command = [sys.executable, "-m", "station.simulation.gige", controller_host, str(truth), serial]
-    process, problem = start_child(command, GIGE_TIMEOUT_S, log)
-    if problem:
-        raise CameraError("simulation-not-started", device="GigE camera", reason=problem)
-    return ChildProcess(process)
+    return start_child("simulated GigE camera", command, GIGE_TIMEOUT_S, log)

@@ -30,10 +30,10 @@ def test_it_is_ready_when_the_call_returns_and_gone_after_the_block() -> None:
 def test_a_bad_truth_file_is_an_error_that_names_it(tmp_path: Path) -> None:
     path = tmp_path / "truth.json"
     path.write_text("{}")
-    with raises("simulation-not-started"):
-        start_controller("UR10", truth=path)
-    with raises("simulation-not-started"):
-        start_controller("UR10", truth=tmp_path / "absent.json")
+    for truth in (path, tmp_path / "absent.json"):
+        with raises("not-started") as problem:
+            start_controller("UR10", truth=truth)
+        assert str(truth) in str(problem.value)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 
@@ -54,7 +53,6 @@ class SessionSummary(msgspec.Struct, frozen=True):
     folder: str
     recording: str
     """File of the recording, or folder of several; empty: nothing was recorded."""
-    source: Source | Literal[""]
     views: int
     sealed: bool
     calibration: str
@@ -144,7 +142,6 @@ def _described(folder: Path) -> SessionSummary:
         name=folder.name,
         folder=str(folder),
         recording=str(files[0] if len(files) == 1 else folder) if files else "",
-        source=state.source if state else "",
         views=sum(pose.counts for pose in state.poses) if state else 0,
         sealed=bool(files) and not any(file.name.endswith(PART_SUFFIX) for file in files),
         calibration=str(calibration) if calibration.is_file() else "",

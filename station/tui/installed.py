@@ -11,7 +11,7 @@ from pathlib import Path
 from calibrate.check.history import FILE as CHECKS_FILE
 from calibrate.check.history import CheckEntry, read_checks
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Calibration, Verdict, read_calibration
+from calibrate.files.calibration import Calibration, Override, Verdict, read_calibration
 from calibrate.files.folders import calibrations_folder, current_version, validity_of
 from calibrate.files.install import objections_beside
 from calibrate.files.touch import agrees
@@ -42,11 +42,11 @@ class Installed:
     log: tuple[LogEntry, ...] = ()
     """Every installation, oldest first."""
 
-    def word(self, session: str) -> str:
-        """State of a session whose calibration is or was installed; else empty."""
-        if self.now is not None and self.now.provenance.session == session:
+    def word(self, calibration: Calibration) -> str:
+        """State of a calibration that is or was installed; else empty."""
+        if same_solve(calibration, self.now):
             return self.held
-        before = any(calibration.provenance.session == session for calibration in self.earlier)
+        before = any(same_solve(calibration, earlier) for earlier in self.earlier)
         return "installed before" if before else ""
 
     @property
@@ -124,7 +124,7 @@ def solved_file(session: SessionStatus, root: Path, camera: str) -> str:
         if (now := read_installed(root, camera).now) is None:
             return ""
         path = root / "sessions" / now.provenance.session / CALIBRATION_FILE
-        if not path.is_file():
+        if not same_solve(now, readable(path)):
             path = current_version(calibrations_folder(root, camera))[1]
     return str(path) if path.is_file() else ""
 
@@ -154,7 +154,7 @@ class Result:
     """None: it cannot be read, and `problem`."""
     state: Installed = Installed()
     objections: tuple[str, ...] = ()
-    """What installing would ask a reason for, besides failed gates."""
+    """What installing would ask a reason for, besides failed gates; none where it is installed."""
     problem: str = ""
 
     @property
@@ -162,13 +162,17 @@ class Result:
         return self.calibration is not None and same_solve(self.calibration, self.state.now)
 
     @property
+    def taken(self) -> Override | None:
+        """A person's decision by which it is installed although something speaks against it."""
+        return self.state.now.override if self.installed and self.state.now else None
+
+    @property
     def verdict(self) -> Verdict:
         """PASS WITH A REASON: all gates pass, but installing needed a reason, or would."""
         if self.calibration is None or self.calibration.verdict == "FAIL":
             return "FAIL"
         off = not all(map(agrees, self.calibration.verification))
-        taken = self.installed and self.state.now is not None and self.state.now.override is not None
-        if taken or off or (self.objections and not self.installed):
+        if self.taken or off or self.objections:
             return "PASS WITH A REASON"
         return self.calibration.verdict
 
@@ -177,10 +181,11 @@ def read_result(path: str) -> Result:
     """Read the result, for a thread. What cannot be read is said in `problem`."""
     try:
         root, calibration = state_root(path), read_calibration(Path(path))
-        objections = tuple(objections_beside(calibration, root))
+        state = read_installed(root, calibration.camera_name)
+        found = [] if same_solve(calibration, state.now) else objections_beside(calibration, root)
     except CalibrationError as problem:
         return Result(path, problem=str(problem))
-    return Result(path, calibration, read_installed(root, calibration.camera_name), objections)
+    return Result(path, calibration, state, tuple(found))
 
 
 @dataclass(frozen=True)
@@ -200,12 +205,9 @@ def read_sessions(root: Path, camera: str) -> tuple[Kept, ...]:
     """Read what became of each session, newest first; for a thread."""
     installed = read_installed(root, camera)
     judged = {check.recording: check for check in installed.checks}
-    return tuple(
-        Kept(
-            session,
-            readable(Path(session.calibration)) if session.calibration else None,
-            installed.word(session.name),
-            judged.get(session.name),
-        )
-        for session in list_sessions(root)
-    )
+    kept = []
+    for session in list_sessions(root):
+        made = readable(Path(session.calibration)) if session.calibration else None
+        word = "" if made is None else installed.word(made)
+        kept.append(Kept(session, made, word, judged.get(session.name)))
+    return tuple(kept)

@@ -20,7 +20,6 @@ from calibrate.files.formatting import accuracy_text, arm_sentences, figures, no
 from calibrate.files.install import change_text
 from calibrate.files.touch import LIMIT_SIGMAS, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import ValidityState, validity_text
-from calibrate.files.versions import same_solve
 from calibrate.results import Gate
 from recordings.cli.console import open_in_browser
 from station.cell.session_folder import REPORT_FILE
@@ -46,21 +45,17 @@ def verdict_lines(result: Result) -> Content:
     if calibration is None:
         return Content(result.problem or NO_RESULT)
     quality = calibration.quality
-    state = "ready to install" if result.verdict == "PASS" else "installs only with a reason"
-    before = any(same_solve(earlier, calibration) for earlier in result.state.earlier)
-    if result.installed:
-        state = result.state.held
-    elif before:
-        state = "installed before"
+    became = result.state.word(calibration)
+    new = "ready to install" if result.verdict == "PASS" else "installs only with a reason"
     said = use_text(calibration)
     if result.verdict == "PASS WITH A REASON":
         said = accuracy_text(calibration)
-    rows = [Content.styled(f"{SHOWN[result.verdict][0]} {result.verdict}, {state}\n{said}", "bold")]
+    rows = [Content.styled(f"{SHOWN[result.verdict][0]} {result.verdict}, {became or new}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID
         rows.append(Content.styled(sentence(validity_text(validity)), "bold $warn" if doubted else ""))
     rows += map(Content, _to_do(result, calibration))
-    if before:
+    if became and not result.installed:
         last = result.state.log[-1]
         why = f" (“{last.reason}”)" if last.reason else ""
         rows.append(Content(f"The last change: {last.action} by {last.who}, {local(last.wall)}{why}."))
@@ -80,14 +75,13 @@ def verdict_lines(result: Result) -> Content:
 
 def _to_do(result: Result, calibration: Calibration) -> Iterator[str]:
     """Yield objections and the way on; of an overridden installation who gave which reason."""
-    if result.installed and result.state.now is not None and (taken := result.state.now.override) is not None:
+    if (taken := result.taken) is not None:
         yield f"Override by {taken.who}: “{taken.reason}”"
         return
-    objections = () if result.installed else result.objections
-    step = after_solve(calibration, objections)
-    if step.kind is not StepKind.INSTALL and step.text not in objections:
+    step = after_solve(calibration, result.objections)
+    if step.kind is not StepKind.INSTALL and step.text not in result.objections:
         yield str(step)
-    yield from (f"▲ {objection}" for objection in objections)
+    yield from (f"▲ {objection}" for objection in result.objections)
 
 
 def check_rows(result: Result, calibration: Calibration) -> list[Row]:

@@ -296,7 +296,7 @@ def _with_result(result: Result, status: StationStatus) -> Action:
     calibration = result.calibration
     if calibration is None:
         return Action("", "Choose a session", result.problem, at="sessions", look=True)
-    step = after_solve(calibration, () if result.installed else result.objections)
+    step = after_solve(calibration, result.objections)
     if result.installed and (validity := result.state.validity) is not None and result.state.doubted:
         return Action("n", "Plan 25 poses", sentence(validity_text(validity)), at="plan", look=True)
     if result.installed:

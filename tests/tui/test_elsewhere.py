@@ -9,7 +9,7 @@ import pytest
 from textual.widgets import DataTable
 
 from calibrate.check.history import CheckEntry, append_check
-from calibrate.files.calibration import write_calibration
+from calibrate.files.calibration import Calibration, read_calibration, write_calibration
 from calibrate.files.folders import calibrations_folder
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
@@ -34,6 +34,10 @@ def root(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     monkeypatch.setattr(app_module, "LOOK_S", 0.05)
     link.root = tmp_path
     return tmp_path
+
+
+def solve_of(root: Path, session: str) -> Calibration:
+    return read_calibration(root / "sessions" / session / "calibration.yaml")
 
 
 def put(root: Path, session: str) -> None:
@@ -93,9 +97,24 @@ async def test_the_result_says_what_is_installed_and_who_took_it_back(link: Fake
 def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
     put(root, "s-1")
     note_installed(root, [OFF])
-    assert read_installed(root).word("s-1") == "INSTALLED, in doubt"
+    assert read_installed(root).word(solve_of(root, "s-1")) == "INSTALLED, in doubt"
     put(root, "s-2")
     assert {c.provenance.session for c in read_installed(root).earlier} == {"s-1"}
+
+
+async def test_a_session_that_was_solved_again_is_not_what_is_installed(link: FakeLink, root: Path) -> None:
+    """The list, the result and what is shown before a session say the same of each solve."""
+    put(root, "s-1")
+    again = msgspec.structs.replace(solve_of(root, "s-1"), created="2026-01-03")
+    write_calibration(again, root / "sessions" / "s-1" / "calibration.yaml")
+    link.show(in_session(idle(), name="", poses=()))
+    async with opened(link) as pilot:
+        app = pilot.app
+        await until(pilot, lambda: app.known.result and app.known.sessions)
+        assert app.known.result.installed
+        assert [kept.word for kept in app.known.sessions] == ["", ""]
+        await app.show_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
+        await until(pilot, lambda: "ready to install" in text_of(app, "#verdict"))
 
 
 async def test_after_a_drift_check_the_result_is_what_it_judged(link: FakeLink, root: Path) -> None:

@@ -51,7 +51,7 @@ def calibration(tmp_path: Path) -> Path:
         (Result("", GOOD), "PASS"),
         (Result("", DOUBTED), "PASS WITH A REASON"),
         (Result("", GOOD, objections=("another camera",)), "PASS WITH A REASON"),
-        (Result("", GOOD, Installed(GOOD), ("another camera",)), "PASS"),
+        (Result("", GOOD, Installed(GOOD)), "PASS"),
         (Result("", problem="damaged"), "FAIL"),
     ],
 )
@@ -215,5 +215,5 @@ def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() ->
     doubt = Validity(1, ValidityState.IN_DOUBT, "2026-11-22T04:50:00+00:00", reason)
     state = Installed(GOOD, validity=doubt)
     told = verdict_lines(Result("", GOOD, state)).plain
-    assert state.word(GOOD.provenance.session) == "INSTALLED, in doubt"
+    assert state.word(GOOD) == "INSTALLED, in doubt"
     assert "PASS, INSTALLED, in doubt" in told and reason.text in told

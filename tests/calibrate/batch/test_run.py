@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,14 +22,18 @@ from calibrate.resource_limits import Limits
 from tests.patience import PATIENCE_S, wait_until
 
 
+def processes() -> Iterator[tuple[int, int, int]]:
+    """Number, parent and session of every process, dead ones excepted."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, parent, _, session = stat.read_text().rpartition(")")[2].split()[:4]
+            if state != "Z":
+                yield int(stat.parent.name), int(parent), int(session)
+
+
 def worker_pids() -> list[int]:
     """List the pool's processes: the fork server, a child of this process, started them."""
-    parents: dict[int, int] = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
+    parents = {pid: parent for pid, parent, _ in processes()}
     return [pid for pid, parent in parents.items() if parents.get(parent) == os.getpid()]
 
 
@@ -155,14 +159,8 @@ def test_a_name_may_be_long_and_of_any_bytes(recordings: list[Path], tmp_path: P
 
 
 def of_session(leader: int) -> set[int]:
-    """Processes of the session that `leader` began, dead ones excepted."""
-    found = set()
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):
-            state, _, _, session = stat.read_text().rpartition(")")[2].split()[:4]
-            if int(session) == leader and state != "Z":
-                found.add(int(stat.parent.name))
-    return found
+    """Processes of the session that `leader` began."""
+    return {pid for pid, _, session in processes() if session == leader}
 
 
 @pytest.mark.process

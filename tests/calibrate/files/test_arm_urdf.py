@@ -21,7 +21,7 @@ from calibrate.geometry import Array, Transform, inverse, pose, rotation_exp
 from calibrate.job import SolvedRecording
 from tests.calibrate.chains import ROWS, DhArm
 from tests.calibrate.files.test_exports import calibration as calibration
-from tests.calibrate.files.test_exports import offered_arm
+from tests.calibrate.files.test_exports import offered_arm, urdf_origin
 from tests.codes import raises
 
 X = pose(rotation_exp([0.4, -2.1, 1.3]), [0.12, -0.05, 0.17])
@@ -80,10 +80,7 @@ def by_hand(text: bytes, q: Array, parent: str, child: str) -> Array:
         T = np.eye(4)
         while link in up:
             joint = up[link]
-            found = joint.find("origin")
-            values = {} if found is None else found.attrib
-            xyz, rpy = ([float(v) for v in values.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
-            step = pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
+            step = urdf_origin(joint)
             if joint.get("type") in ("revolute", "continuous"):
                 axis = np.array([float(v) for v in joint.find("axis").get("xyz").split()])
                 angle = q[int(joint.get("name").removeprefix("joint_"))]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -14,12 +12,13 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.exports import FrameNames, export
+from calibrate.files.exports import FrameNames
 from calibrate.files.exports.drivers import fixed_frames
 from calibrate.geometry import Array, pose
 from recordings.importers.frames import FrameTree
 from recordings.schema.messages import RobotIdentity
 from tests.calibrate.files.test_exports import calibration as calibration
+from tests.calibrate.files.test_exports import export, published, urdf_origin
 from tests.codes import raises
 from tests.recordings.test_bag_frames import frame, turned
 
@@ -85,15 +84,6 @@ def written(frames: Frames, kind: str, folder: Path) -> Path:
     return path
 
 
-def published(launch: bytes) -> tuple[str, str, Array]:
-    """Parent, child and parent_from_child by static_transform_publisher's rule."""
-    found = re.search(r"arguments=(\[.*?\])", launch.decode(), re.DOTALL)
-    words = ast.literal_eval(found[1])
-    said = dict(zip(words[::2], words[1::2], strict=True))
-    R = Rotation.from_quat([float(said[f"--q{axis}"]) for axis in "xyzw"]).as_matrix()
-    return said["--frame-id"], said["--child-frame-id"], pose(R, [float(said[f"--{a}"]) for a in "xyz"])
-
-
 def looked_up(tree: dict[str, tuple[str, Array]], parent: str, child: str) -> Array:
     """By tf2's rule: one parent a frame, the product along the chain."""
     T = np.eye(4)
@@ -121,9 +111,7 @@ def test_the_driver_s_lens_is_where_it_was_calibrated(
     of_urdf = ElementTree.fromstring(export(calibration, "urdf", names))
     assert {link.get("name") for link in of_urdf.iter("link")} >= {parent, top}
     (joint,) = of_urdf.findall("joint")
-    origin = joint.find("origin")
-    numbers = [tuple(map(float, origin.attrib[name].split())) for name in ("xyz", "rpy")]
-    np.testing.assert_allclose(matrix(*numbers), T, atol=1e-12)
+    np.testing.assert_allclose(urdf_origin(joint), T, atol=1e-12)
 
 
 @pytest.mark.parametrize("driver", DRIVERS)

@@ -136,14 +136,19 @@ def same(found: Array, calibration: Calibration, tolerance: float = 1e-12) -> No
     assert np.abs(found - calibration.transform.matrix).max() < tolerance
 
 
-def ros_launch(text: str) -> Array:
-    """The words of tf2_ros's static_transform_publisher."""
-    words = ast.literal_eval(re.search(r"arguments=(\[.*?\])", text, re.DOTALL)[1])
+def published(launch: str) -> tuple[str, str, Array]:
+    """Parent, child and parent_from_child by the words of tf2_ros's static_transform_publisher."""
+    words = ast.literal_eval(re.search(r"arguments=(\[.*?\])", launch, re.DOTALL)[1])
     said = dict(zip(words[::2], words[1::2], strict=True))
-    assert said["--frame-id"] in ("tool0", "base")
-    assert said["--child-frame-id"] == "camera_calibrated_optical_frame"
     R = Rotation.from_quat([float(said[f"--q{axis}"]) for axis in "xyzw"]).as_matrix()
-    return pose(R, [float(said[f"--{axis}"]) for axis in "xyz"])
+    T = pose(R, [float(said[f"--{axis}"]) for axis in "xyz"])
+    return said["--frame-id"], said["--child-frame-id"], T
+
+
+def ros_launch(text: str) -> Array:
+    parent, child, T = published(text)
+    assert parent in ("tool0", "base") and child == "camera_calibrated_optical_frame"
+    return T
 
 
 def halcon(text: str) -> Array:
@@ -216,12 +221,11 @@ def test_simulated_is_stamped_and_a_session_name_never_leaves_the_comment(
 
 
 def urdf_origin(joint: ElementTree.Element) -> Array:
-    """URDF's rule: rpy about fixed axes, R = Rz Ry Rx."""
-    origin = joint.find("origin")
-    xyz = [float(v) for v in origin.attrib["xyz"].split()]
-    r, p, y = (float(v) for v in origin.attrib["rpy"].split())
-    R = rotation_exp([0, 0, y]) @ rotation_exp([0, p, 0]) @ rotation_exp([r, 0, 0])
-    return pose(R, xyz)
+    """URDF's rule: rpy about fixed axes, R = Rz Ry Rx; zero where none is told."""
+    found = joint.find("origin")
+    told = {} if found is None else found.attrib
+    xyz, rpy = ([float(v) for v in told.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
+    return pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
 
 
 @pytest.mark.parametrize("off_rad", [1.2, 0.0, 1e-9, 1e-7])

@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from recordings.images import Pixels, viewable
-from recordings.schema.messages import Image, RobotState, Stamps, View
+from recordings.schema.messages import Image, RobotState, View
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion, sight
 from station.cell.config import matrix4
@@ -50,12 +50,6 @@ async def take_pose(context: SessionContext, index: int, attempt: int, unchecked
     _enter(context, index, StationState.CAPTURING)
     image = context.require_recording().number(await take_image(context, index))
     state, bound_s = await at_exposure(context, image)
-    stamps = Stamps(
-        host_monotonic_ns=state.stamps.host_monotonic_ns,
-        host_wall_ns=state.stamps.host_wall_ns,
-        controller_s=state.stamps.controller_s,
-        device_ns=image.stamps.device_ns + round(image.exposure_us * 500),
-    )
     view = View(
         index=index,
         name=context.loaded().pose(index).name,
@@ -63,7 +57,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int, unchecked
         base_from_flange=matrix4(flange_pose(state, context.cell.arm.identity.tcp_offset)),
         joints_rad=state.joints_rad or None,
         attempt=attempt,
-        stamps=stamps,
+        stamps=state.stamps,
         time_bound_s=bound_s,
         stillness=still,
     )

@@ -59,9 +59,9 @@ async def test_it_is_the_pose_of_mid_exposure(rig: Rig, monkeypatch: pytest.Monk
     views = sealed(rig).views()
     assert len(views) == POSES
     for view, picture in zip(views, pictures, strict=True):
-        stamps, middle_ns = picture.stamps, picture.time.host_monotonic_ns if picture.time else 0
+        middle_ns = picture.time.host_monotonic_ns if picture.time else 0
         assert view.stamps.host_monotonic_ns == middle_ns
-        assert view.stamps.device_ns == stamps.device_ns + round(500 * picture.exposure_us) > stamps.device_ns
+        assert not view.stamps.device_ns, "the camera's clock did not see the arm"
         assert view.joints_rad[0] == pytest.approx(turned[middle_ns], abs=1e-12)
 
 

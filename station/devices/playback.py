@@ -98,8 +98,8 @@ class PlaybackRobot:
         """Raises RobotError for a recording that cannot be read or has no joints."""
         self.path = recording
         try:
-            self._recording: Recording = open_recording(recording)
-            self.views: list[View] = self._recording.views()
+            self.recording: Recording = open_recording(recording)
+            self.views: list[View] = self.recording.views()
         except RecordingError as error:
             raise RobotError("unreadable-recording", recording=recording, reason=str(error)) from error
         poses, with_joints = len(self.views), sum(len(v.joints_rad or ()) == 6 for v in self.views)
@@ -111,7 +111,7 @@ class PlaybackRobot:
         self._callbacks: list[Callable[[RobotState], None]] = []
         self._publishing: asyncio.Task[None] | None = None
         self.control = False
-        self.identity, self.camera = self._recording.info.robot, self._recording.info.camera_identity
+        self.identity, self.camera = self.recording.info.robot, self.recording.info.camera_identity
         self.control_path, self.notice, self.remote, self.kinematics = "", "", None, None
         self.control_trouble = "", ""
         self.payload: tuple[float, ...] = ()
@@ -122,12 +122,12 @@ class PlaybackRobot:
         poses = tuple(
             PlannedPose(v.name, _joints(v), v.base_from_flange, why="of the recording") for v in self.views
         )
-        return Plan(self.identity.model, self._recording.info.mount, poses, note="playback")
+        return Plan(self.identity.model, self.recording.info.mount, poses, note="playback")
 
     def picture(self) -> Image:
         """Return the image of the view at which the arm stands. CameraError: undecodable."""
         try:
-            return self._recording.image(self._view)
+            return self.recording.image(self._view)
         except RecordingError as error:
             raise CameraError.from_data(error.data) from error
 
@@ -239,10 +239,10 @@ def playback_cell(recording: Path) -> Cell:
     RobotError or ConfigError for a recording that is damaged, has no joints or no configuration in it.
     """
     robot = PlaybackRobot(recording)
+    content = robot.recording.attachments().get(CONFIG_NAME, b"")
     try:
-        content = open_recording(recording).attachments().get(CONFIG_NAME, b"")
         recorded = strict_yaml.load(content, StationConfig)
-    except (RecordingError, strict_yaml.StrictYamlError) as error:
+    except strict_yaml.StrictYamlError as error:
         raise ConfigError("no-config", recording=recording, name=CONFIG_NAME, reason=str(error)) from error
     camera = msgspec.structs.replace(
         recorded.camera, driver="playback", device=str(recording), trigger="software"

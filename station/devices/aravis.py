@@ -81,7 +81,7 @@ class AravisCamera:
             told = msgspec.structs.replace(
                 picture, trigger_count=count, exposure_us=exposure_us, gain_db=gain_db
             )
-            return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
+            return self._clock.timed(told, asked_ns, pulse)
 
     async def close(self) -> None:
         device, self._device = self._device, None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from recordings.images import Pixels
-from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
+from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.clocks import monotonic_from_wall_ns
@@ -159,7 +159,7 @@ class GenicamDevice:
                 answered_ns = time.monotonic_ns()
             if device_ns != self._latched_ns:
                 self._latched_ns = device_ns
-                clock.add(ClockReading(asked_ns, answered_ns, device_ns))
+                clock.add(asked_ns, answered_ns, device_ns)
             return
 
     def _to_ns(self, ticks: int) -> int:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import msgspec
 
-from recordings.schema.messages import ClockReading, FrameTime, Image, TimeSource
+from recordings.schema.messages import FrameTime, Image
 from station.cell.clock_fit import ClockFit
 from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
@@ -98,21 +98,19 @@ class DeviceClock:
     """A camera's clock, read over the wire. The bound holds whatever the delays there and back were."""
 
     def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
         self.fit: ClockFit | None = None
         """By the reading that tells most about now; None before the first one."""
 
-    def add(self, reading: ClockReading) -> None:
+    def add(self, asked_ns: int, answered_ns: int, device_ns: int) -> None:
         """Keep a reading that is better than what the last good one still tells.
 
-        One that does not agree with it begins anew: the clock was set or started again.
+        The clock showed `device_ns` between question and answer (host monotonic). A reading that does not
+        agree with the last good one begins anew: the clock was set or started again.
         """
-        half_ns = (reading.answered_monotonic_ns - reading.asked_monotonic_ns) / 2
+        half_ns = (answered_ns - asked_ns) / 2
         # Difference of integers first: stamps of 1.7e18 ns have no room in a float.
-        offset_ns = float(reading.asked_monotonic_ns - reading.device_ns) + half_ns
-        new, kept = ClockFit(reading.device_ns / 1e9, offset_ns, half_ns / 1e9), self.fit
+        offset_ns = float(asked_ns - device_ns) + half_ns
+        new, kept = ClockFit(device_ns / 1e9, offset_ns, half_ns / 1e9), self.fit
         if kept is not None and new.reference_s >= kept.reference_s:
             still_s = kept.bound_at(new.reference_s)
             apart_s = abs(new.offset_ns - kept.offset_ns) / 1e9
@@ -121,10 +119,10 @@ class DeviceClock:
         self.fit = new
 
 
-def by_clock(start_device_ns: int, exposure_us: float, fit: ClockFit, source: TimeSource) -> FrameTime:
+def by_clock(start_device_ns: int, exposure_us: float, fit: ClockFit) -> FrameTime:
     """`start_device_ns`: the camera's clock at the start of the exposure."""
     device_s = start_device_ns / 1e9
-    return FrameTime(fit.to_host_ns(device_s) + round(exposure_us * 500), fit.bound_at(device_s), source)
+    return FrameTime(fit.to_host_ns(device_s) + round(exposure_us * 500), fit.bound_at(device_s), "latched")
 
 
 def by_trigger(fired_ns: int, fired_bound_s: float, exposure_us: float, arrival_ns: int) -> FrameTime:
@@ -137,18 +135,14 @@ def by_trigger(fired_ns: int, fired_bound_s: float, exposure_us: float, arrival_
     return FrameTime(fired_ns + round(exposure_us * 500), fired_bound_s + abs(left_s), "trigger")
 
 
-def by_arrival(
-    arrival_ns: int, exposure_us: float, asked_ns: int | None = None, readout_s: float = UNKNOWN_READOUT_S
-) -> FrameTime:
-    """Time a frame by its first packet: the exposure began after it was asked for, and ended before.
+def by_arrival(arrival_ns: int, exposure_us: float, earliest_ns: int) -> FrameTime:
+    """Time a frame by its first packet: the exposure began after `earliest_ns`, and ended before.
 
-    `asked_ns`: just before its trigger; None = not triggered, then `readout_s` is what can lie between.
-    A frame that came sooner after its trigger than its exposure takes, such as a late answer to an earlier
-    trigger, is bounded by the contradiction.
+    `earliest_ns`: just before its trigger. A frame that came sooner after its trigger than its exposure
+    takes, such as a late answer to an earlier trigger, is bounded by the contradiction.
     """
     exposure_ns = round(exposure_us * 1000)
     latest_ns = arrival_ns - exposure_ns
-    earliest_ns = latest_ns - round(readout_s * 1e9) if asked_ns is None else asked_ns
     middle_ns = (earliest_ns + latest_ns) // 2 + exposure_ns // 2
     return FrameTime(middle_ns, abs(latest_ns - earliest_ns) / 2e9, "arrival")
 
@@ -168,7 +162,7 @@ class FrameClock:
 
     def restart(self) -> None:
         """Forget the clock's readings: call after opening the camera, which may have reset it."""
-        self.readings.restart()
+        self.readings = DeviceClock()
         self._newest, self._impossible, self._opened = None, 0, True
 
     @property
@@ -181,10 +175,10 @@ class FrameClock:
             return FrameTiming("arrival", UNKNOWN_READOUT_S / 2) if self._opened else None
         return FrameTiming("latched", fit.bound_s, fit)
 
-    def timed(self, image: Image, *, asked_ns: int | None = None, pulse: TriggerPulse | None = None) -> Image:
+    def timed(self, image: Image, asked_ns: int, pulse: TriggerPulse | None = None) -> Image:
         """Return the image with its time.
 
-        `asked_ns`: host time just before its trigger; None: not triggered. `pulse`: of the trigger box.
+        `asked_ns`: host time just before its trigger. `pulse`: of the trigger box.
         """
         arrival_ns, fit = image.stamps.host_monotonic_ns, self.readings.fit
         self._newest = by_arrival(arrival_ns, image.exposure_us, asked_ns)
@@ -192,7 +186,7 @@ class FrameClock:
             fired = pulse.host_monotonic_ns, pulse.bound_s
             self._newest = by_trigger(*fired, image.exposure_us, arrival_ns)
         if fit is not None and image.stamps.device_ns:
-            told = by_clock(image.stamps.device_ns, image.exposure_us, fit, "latched")
+            told = by_clock(image.stamps.device_ns, image.exposure_us, fit)
             if _possible(told, image, asked_ns):
                 self._newest = told
             else:
@@ -200,8 +194,8 @@ class FrameClock:
         return msgspec.structs.replace(image, time=self._newest)
 
 
-def _possible(told: FrameTime, image: Image, asked_ns: int | None) -> bool:
+def _possible(told: FrameTime, image: Image, asked_ns: int) -> bool:
     """Tell whether a time is possible: exposure begins after the trigger and ends before the arrival."""
     half_ns, bound_ns = image.exposure_us * 500, told.bound_s * 1e9
     ended = told.host_monotonic_ns + half_ns - bound_ns <= image.stamps.host_monotonic_ns
-    return ended and (asked_ns is None or told.host_monotonic_ns - half_ns + bound_ns >= asked_ns)
+    return ended and told.host_monotonic_ns - half_ns + bound_ns >= asked_ns

@@ -154,8 +154,9 @@ class WebcamCamera:
         self._check(video)
         while time.monotonic_ns() < asked_ns + timeout_s * 1e9:
             arrived_ns = self._grab(video)
-            if arrived_ns - round(self._exposure_us() * 1000) - LATENCY_S * 1e9 >= asked_ns:
-                return self._image(video, arrived_ns)
+            begun_ns = arrived_ns - round(self._exposure_us() * 1000) - round(LATENCY_S * 1e9)
+            if begun_ns >= asked_ns:
+                return self._image(video, arrived_ns, begun_ns)
         raise CameraError("no-image", limit_s=timeout_s)
 
     def _check(self, video: cv2.VideoCapture) -> None:
@@ -172,7 +173,8 @@ class WebcamCamera:
         stamp_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         return stamp_ns if 0 <= now_ns - stamp_ns < _FOUND_AT_S * 1e9 else now_ns
 
-    def _image(self, video: cv2.VideoCapture, arrived_ns: int) -> Image:
+    def _image(self, video: cv2.VideoCapture, arrived_ns: int, begun_ns: int) -> Image:
+        """`begun_ns`: when its exposure began at the earliest, host monotonic."""
         good, pixels = video.retrieve()
         if not good:
             raise CameraError("frame-incomplete", reason="it cannot be decoded")
@@ -188,7 +190,7 @@ class WebcamCamera:
             sequence=0,
             exposure_us=exposure_us,
             pixel_format="Mono8" if grey else "BGR8",
-            time=by_arrival(arrived_ns, exposure_us, readout_s=LATENCY_S),
+            time=by_arrival(arrived_ns, exposure_us, begun_ns),
         )
 
     def _exposure_us(self) -> float:

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from calibrate.geometry import Array
-from recordings.schema.messages import CameraIdentity, ClockReading, Image
+from recordings.schema.messages import CameraIdentity, Image
 from station.analysis.pool import WorkerError, Workers
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError, RobotError
@@ -96,7 +96,7 @@ class RenderedCamera:
             asked_ns = time.monotonic_ns()
             frame = await self._call("trigger", timeout_s=timeout_s)
             self.counter.accept(frame.frame_id)
-            return self._clock.timed(_dated(frame), asked_ns=asked_ns)
+            return self._clock.timed(frame, asked_ns)
 
     async def settings(self) -> dict[str, object]:
         return {
@@ -110,7 +110,8 @@ class RenderedCamera:
         """Render a new image at half the size."""
         async with self._asking:
             await self._ready()
-            return _dated(await self._call("preview"))
+            image: Image = await self._call("preview")
+            return image
 
     async def close(self) -> None:
         workers, self._workers, self._lost = self._workers, None, False
@@ -135,7 +136,7 @@ class RenderedCamera:
     async def _read_clock(self) -> None:
         asked_ns = time.monotonic_ns()
         device_ns = await self._call("clock")
-        self._clock.readings.add(ClockReading(asked_ns, time.monotonic_ns(), device_ns))
+        self._clock.readings.add(asked_ns, time.monotonic_ns(), device_ns)
 
     async def _call(self, name: str, *arguments: object, timeout_s: float = _ANSWER_S) -> Any:
         if self._workers is None:
@@ -148,10 +149,3 @@ class RenderedCamera:
             raise CameraError("camera-gone", camera=self.identity.serial) from None
         except RobotError as error:
             raise CameraError("camera-refused", doing=name, reason=str(error)) from None
-
-
-def _dated(frame: Image) -> Image:
-    """Add this computer's wall clock at the frame's arrival."""
-    age_ns = time.monotonic_ns() - frame.stamps.host_monotonic_ns
-    stamps = msgspec.structs.replace(frame.stamps, host_wall_ns=time.time_ns() - age_ns)
-    return msgspec.structs.replace(frame, stamps=stamps)

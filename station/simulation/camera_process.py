@@ -75,7 +75,8 @@ class CameraProcess:
         picture = self.picture(start_ns, camera)
         arrival_ns = start_ns + round(self.light.exposure_us * 1000) + READOUT_NS
         time.sleep(max(0.0, (arrival_ns - time.monotonic_ns()) / 1e9))
-        stamps = Stamps(host_monotonic_ns=arrival_ns, device_ns=self.device_ns(start_ns))
+        wall_ns = time.time_ns() - (time.monotonic_ns() - arrival_ns)
+        stamps = Stamps(arrival_ns, wall_ns, device_ns=self.device_ns(start_ns))
         return Image(picture, stamps, frame_id, 0, self.light.exposure_us, self.light.gain_db)
 
     def picture(self, start_ns: int, camera: CameraModel) -> NDArray[np.uint8]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -56,9 +55,8 @@ def _rehearse(config: Path, root: Path | None) -> None:
 
     what = ["--config", str(config), "--rehearse", *([] if root is None else ["--root", str(root)])]
     err.print(f"Starting the rehearsal of {config}: SIMULATED, nothing real moves …")
-    with (
-        tempfile.TemporaryDirectory(prefix="rehearsal-") as folder,
-        own_daemon(what, Path(folder) / "daemon.log") as socket,
-    ):
+    log = state_root(root) / "rehearsal" / "daemon.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with own_daemon(what, log) as socket:
         run(socket)
     err.print(f"The rehearsal has ended. `station new` opens the wizard again; {config} is as it was.")

@@ -16,7 +16,8 @@ import numpy as np
 import yaml
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, transform_points
+from calibrate.geometry import Array, transform_points
+from calibrate.views import board_in_camera
 from recordings.files import ASKED_FOR, read_file, write_atomically
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from recordings.strict_yaml import LIMIT_BYTES
@@ -160,7 +161,11 @@ def made_config(draft: Draft) -> StationConfig:
     if found is None:  # nothing moves, so nothing is planned
         robot = RobotConfig(driver="posted", model=draft.posted)
         return StationConfig(name="cell", mount=draft.mount, robot=robot, camera=opened, board=draft.board)
-    Y_m = float(np.hypot(found.sigma_m, found.sigma_rad * float(np.linalg.norm(_seen_at(found, draft)))))
+    flange = np.array(draft.views[0].base_from_flange)
+    camera_from_board = board_in_camera(draft.mount, flange, found.X, found.Y)
+    middle = transform_points(camera_from_board, board_points(draft.board).mean(axis=0))
+    distance_m = float(np.linalg.norm(middle))
+    Y_m = float(np.hypot(found.sigma_m, found.sigma_rad * distance_m))
     return StationConfig(
         name="cell",
         mount=draft.mount,
@@ -170,19 +175,8 @@ def made_config(draft: Draft) -> StationConfig:
         camera_guess=_guess(found.X, found.sigma_m, found.sigma_rad),
         board_guess=_guess(found.Y, min(Y_m, 2 * found.sigma_m), found.sigma_rad),
         limits=limits_of(draft, found),
-        working_distance_m=round(float(np.linalg.norm(_seen_at(found, draft))), 3),
+        working_distance_m=round(distance_m, 3),
     )
-
-
-def _seen_at(found: FoundCell, draft: Draft) -> Array:
-    """Compute the board's centre (3,) in `camera` at the first view, m."""
-    assert draft.board is not None
-    flange = np.array(draft.views[0].base_from_flange)
-    in_hand = draft.mount == "eye-in-hand"
-    camera_from_board = (
-        inverse(flange @ found.X) @ found.Y if in_hand else inverse(found.X) @ flange @ found.Y
-    )
-    return np.asarray(transform_points(camera_from_board, board_points(draft.board).mean(axis=0)))
 
 
 def _guess(T: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:

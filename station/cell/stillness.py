@@ -32,9 +32,6 @@ _DECADES = 3.0
 KEPT_SAMPLES = 4096
 
 
-_TOO_FEW = "too few robot states"
-
-
 def _speed_rad_s(state: RobotState) -> float:
     """Speed of the fastest joint; 0 where none is told."""
     return max(map(abs, state.joint_speeds_rad_s), default=0.0)
@@ -95,8 +92,10 @@ class StillnessMonitor:
             image_motion_px=image_motion_px,
         )
 
-    def unrest(self, found: Stillness) -> str:
-        """Name what still moves; empty: settled."""
+    def unrest(self, found: Stillness | None) -> str:
+        """Name what still moves, or that too little was measured; empty: settled."""
+        if found is None:
+            return "too few robot states"
         return ", ".join(
             f"{what} {scale * value:.{digits}f}{unit} (limit {scale * limit:.{digits}f})"
             for value, limit, scale, what, unit, digits in self._checks(found)
@@ -127,8 +126,7 @@ class StillnessMonitor:
         states = self._states.copy()
         if not states or self._turns(states[-1]):
             return False
-        found = self.measure()
-        return found is not None and not self.unrest(found)
+        return not self.unrest(self.measure())
 
     async def settle(
         self,
@@ -147,7 +145,7 @@ class StillnessMonitor:
         while True:
             old = alive() is None
             found = self.measure() if not old else None
-            unrest = self.unrest(found) if found is not None else _TOO_FEW
+            unrest = self.unrest(found)
             code = "no-news" if old else "not-settled"
             if found is None or unrest:
                 resting_since_ns = None
@@ -178,8 +176,7 @@ class StillnessMonitor:
         """
         speeds, limit = np.abs(state.joint_speeds_rad_s), self._limits.joint_speed_rad_s
         if not len(speeds):
-            found = self.measure()
-            if unrest := self.unrest(found) if found is not None else _TOO_FEW:
+            if unrest := self.unrest(self.measure()):
                 raise NotStillError(unrest=unrest, limit_s=self._limits.window_s)
             return
         joint = int(speeds.argmax())

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -57,33 +56,18 @@ class FoundCell(QuickFit):
 
     @property
     def good(self) -> bool:
-        return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD and not self.cause
+        return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD and self.problem is None
 
     @property
-    def cause(self) -> Literal["", "other-mounting", "square-size", "moved"]:
-        """Code of what is probably wrong; empty: nothing."""
+    def problem(self) -> StationError | None:
+        """Make the error for what is probably wrong; None: nothing."""
         if self.other_fits:
-            return "other-mounting"
+            return StationError("other-mounting")
         if abs(self.scale - 1) > _WRONG_SCALE:
-            return "square-size"
-        return "moved" if self.spread_m > _MOVED_M else ""
-
-    @property
-    def warning(self) -> str:
-        """Say what is probably wrong, and the remedy; empty: nothing."""
-        if self.cause == "other-mounting":
-            return "These views fit the other mounting: camera on the flange, or beside the arm."
-        if self.cause == "square-size":
-            return (
-                f"By the arm's travel the squares are {self.scale:.2f} times as large as stated. "
-                "Measure one and correct the board: the views stay."
-            )
-        if self.cause == "moved":
-            return (
-                f"The board or the camera moved: the views see it {1000 * self.spread_m:.0f} mm apart. "
-                "Fix both, take back the views and begin again."
-            )
-        return ""
+            return StationError("square-size", scale=self.scale)
+        if self.spread_m > _MOVED_M:
+            return StationError("board-or-camera-moved", spread_m=self.spread_m)
+        return None
 
 
 def find_cell(

@@ -94,13 +94,12 @@ class HandGuide:
         if seen is not self._seen:
             before, self._seen = self._seen, seen
             self._motion_px = None if before is None else motion_px(before, seen)
-        found, moves, still = self._stillness.measure(self._motion_px), "too few robot states", 0.0
+        found, moves = self._stillness.measure(self._motion_px), ""
         try:
             self._latest()
         except RobotError as error:  # what was measured is not of now
             found, moves = None, str(error)
-        if found is not None:
-            moves, still = self._stillness.unrest(found), self._stillness.rest(found)
+        moves = moves or self._stillness.unrest(found)
         if (found is not None and moves) or self._motion_px is None:
             self._moved_s, self._again_s = time.monotonic(), 0.0
         tried = time.monotonic() < self._again_s
@@ -110,15 +109,16 @@ class HandGuide:
                 self._given_up.append(wanted.camera_from_board)
                 self._known, self._moved_s = None, time.monotonic()
         # With fewer the lens is rough, and its error would pass for one of board or mounting.
-        known = wanted.found if len(wanted.seen) >= FEWEST_FOR_LENS else None
+        judged = wanted.found if len(wanted.seen) >= FEWEST_FOR_LENS else None
+        problem = None if judged is None else judged.problem
         return GuidanceStatus(
             outline=wanted.drawn,
             words=way.words,
-            still=round(still, 2),
+            still=0.0 if found is None else round(self._stillness.rest(found), 2),
             moves=moves,
             after_mm=None if wanted.after_m is None else round(1000 * wanted.after_m, 3),
-            cause="" if known is None else known.cause,
-            warning="" if known is None else known.warning,
+            cause="" if problem is None else problem.code,
+            warning=str(problem or ""),
         )
 
     async def _next(

@@ -223,7 +223,7 @@ class GuidanceStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     after_mm: float | None = None
     """Predicted error after the wanted view; now: `EstimateStatus.predicted_error_mm`."""
     cause: str = ""
-    """What is probably wrong with the cell: other-mounting, square-size or moved; empty: nothing."""
+    """Code of what is probably wrong with the cell; empty: nothing."""
     warning: str = ""
     """The cause for people, and its remedy."""
     enough: bool = False

@@ -289,8 +289,8 @@ class NewCell(LivePageApp[Ending]):
         self._say("#live-lines", live_lines(setup, self.step))
         for mount in DRAWINGS:
             self.query_one(f"#{mount}").set_class(mount == setup.mount, "chosen")
-        warning = "" if setup.draft.found is None else setup.draft.found.warning
-        self._say("#problem", problem := self._camera_problem or self._problem or warning)
+        doubt = None if setup.draft.found is None else setup.draft.found.problem
+        self._say("#problem", problem := self._camera_problem or self._problem or str(doubt or ""))
         self.query_one("#problem").display = bool(problem)
 
     def _rail(self) -> tuple[Step, ...]:

@@ -101,7 +101,8 @@ def about(setup: CellSetup, step: CellStep) -> str:
 def typed(setup: CellSetup, step: CellStep) -> str:
     """Return the text that the input line begins with."""
     if step is CellStep.BOARD and (board := setup.draft.board) is not None:
-        if (found := setup.draft.found) is not None and found.cause == "square-size":
+        found = setup.draft.found
+        if found is not None and found.problem is not None and found.problem.code == "square-size":
             board = msgspec.structs.replace(board, square_m=round(board.square_m * found.scale, 4))
         return flow.board_words(board)
     if step is CellStep.BOARD and setup.counts is not None:

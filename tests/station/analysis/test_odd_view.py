@@ -99,5 +99,5 @@ def test_what_cannot_be_is_named_and_what_can_is_not(mount: Mount) -> None:
     count, since = (7, 5) if mount == "eye-in-hand" else (6, 2)
     torn = changed(count, other_tool, slice(since, None))
     found = find_cell(mount, truth.board, blank, False, torn)
-    assert found is None or (found.cause and not found.good)
+    assert found is None or (found.problem and not found.good)
     assert not running_estimate(cell_config(truth), blank, False, torn).enough, "five of seven agree"

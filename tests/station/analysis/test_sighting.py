@@ -13,7 +13,7 @@ from calibrate.boards.model import board_points
 from calibrate.geometry import transform_points
 from calibrate.projection import project_pixels
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.analysis import worker
 from station.analysis.estimation import seen_before
 from station.analysis.worker import sight
@@ -29,6 +29,32 @@ def test_the_distance_is_the_same_in_a_preview_of_half_the_size(factor: float) -
     picture = render(scaled(camera, factor), PAPER_BOARD, view, Light(), np.random.default_rng(0))
     status = sight(picture, PAPER_BOARD, camera, False).status
     assert status.distance_m == pytest.approx(0.5, abs=0.005)
+
+
+OTHER = BoardSpec(BoardKind.CHESSBOARD, columns=9, rows=6, square_m=0.025)
+
+
+@pytest.mark.parametrize(
+    ("cause", "light", "board", "aside_m"),
+    [
+        ("", Light(), PAPER_BOARD, 0.0),
+        ("over-exposed", Light(exposure_us=60_000.0), PAPER_BOARD, 0.0),
+        ("under-exposed", Light(exposure_us=1_500.0), PAPER_BOARD, 0.22),
+        ("under-exposed", Light(exposure_us=1_500.0), PAPER_BOARD, 0.0),
+        ("blurred", Light(blur_px=6.0), PAPER_BOARD, 0.0),
+        ("too-dark", Light(exposure_us=100.0), PAPER_BOARD, 0.0),
+        ("other-board", Light(exposure_us=1_500.0), OTHER, 0.0),
+    ],
+)
+def test_light_is_the_cause_unless_something_else_is(
+    cause: str, light: Light, board: BoardSpec, aside_m: float
+) -> None:
+    view = seen_from(PAPER_BOARD, 0.5)
+    view[0, 3] += aside_m
+    picture = render(make_cell("paper-binned").camera, PAPER_BOARD, view, light, np.random.default_rng(0))
+    status = sight(picture, board, None, exposure=(light.exposure_us, 0.0)).status
+    assert status.cause == cause and bool(status.advice) == (light != Light())
+    assert not sight(picture, board, None, False).status.advice, "an image of unknown exposure"
 
 
 def test_distance_and_tilt_are_those_by_a_fisheye_lens(monkeypatch: pytest.MonkeyPatch) -> None:

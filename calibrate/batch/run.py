@@ -106,8 +106,7 @@ def batch_key(recording: Path, options: JobOptions) -> str:
         for file in sorted(recording.iterdir()) if recording.is_dir() else [recording]:
             stat = file.stat()
             found.append((os.fsencode(file.name), stat.st_size, stat.st_mtime_ns))
-    chosen = {name: msgspec.to_builtins(value) for name, value in vars(options).items() if name != "threads"}
-    parts = [found, chosen, solver_software()]
+    parts = [found, options.profile, options.seed, options.chosen, solver_software()]
     return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()[:24]
 
 

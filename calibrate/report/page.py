@@ -248,13 +248,11 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
 
 def _views(job: SolvedRecording) -> Iterator[str]:
     """Rejected views and why, then pictures: of those, of suspect ones and of those that fit worst."""
-    rejected = {view.index: view.reason for view in job.calibration.views.rejected}
+    rejected = job.calibration.views.rejected
     if rejected:
-        names = {view.index: view.name for view in job.recording.views()}
-        yield html.table(
-            ("pose", "name", "reason"),
-            [(str(index + 1), names.get(index, ""), reason) for index, reason in rejected.items()],
-        )
+        rows = [(str(view.index + 1), view.name, view.reason) for view in rejected]
+        yield html.table(("pose", "name", "reason"), rows)
+    left_out = {view.index for view in rejected}
     figures, suspects = dict[float, str](), job.solution.suspects
     for view in job.recording.views():
         seen = job.loaded.detections.get(view.index)
@@ -262,11 +260,11 @@ def _views(job: SolvedRecording) -> Iterator[str]:
             continue
         picture, off_px = _drawn_in(job, view, _OTHER_WIDTH_PX)
         caption = f"pose {view.index + 1}: {off_px:.2f} px"
-        if view.index in rejected:
+        if view.index in left_out:
             caption += ", rejected"
         elif view.index in suspects:
             caption += f", suspect: P(outlier) {suspects[view.index]:.0%}"
-        rank = (view.index in rejected) + suspects.get(view.index, 0.0)
+        rank = (view.index in left_out) + suspects.get(view.index, 0.0)
         figures[rank * _AHEAD_PX + off_px] = html.figure(picture, caption)
     worst = sorted(figures, reverse=True)[:_PICTURES_LIMIT]
     yield html.side_by_side("views", (figures[rank] for rank in worst))

@@ -68,6 +68,7 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
 def test_nothing_installed_is_said(session_file: Path, tmp_path: Path) -> None:
     refused(run("drift-check", session_file, cwd=tmp_path), 1, "nothing-installed")
     refused(run("rollback", cwd=tmp_path), 1, "nothing-installed")
+    refused(run("withdraw", "a pallet hit it", cwd=tmp_path), 1, "nothing-installed")
     refused(run("show", cwd=tmp_path), 1, "nothing-installed")
     assert list(tmp_path.iterdir()) == [], "a slip in --root or --camera makes no folder"
 

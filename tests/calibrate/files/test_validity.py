@@ -226,12 +226,6 @@ def test_a_state_may_be_given_by_its_name_and_no_other_one(root: Path) -> None:
         set_validity(root, "validd", MOVED)
 
 
-def test_nothing_is_made_where_nothing_is_installed(tmp_path: Path) -> None:
-    with raises("nothing-installed", InstallError):
-        set_validity(tmp_path, W, KNOCKED)
-    assert list(tmp_path.iterdir()) == []
-
-
 # --- several cameras ---
 def test_each_camera_has_its_own(root: Path, make_file: MakeFile) -> None:
     install(make_file(0.001), root, camera="wrist")

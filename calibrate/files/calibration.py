@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from calibrate.arm_table import CorrectedArm, FramePose
 from calibrate.errors import CalibrationFileError
 from calibrate.files.integrity import check_result, content_sha256, read_bounded, verified_plain
-from calibrate.files.touch import Touch
+from calibrate.files.touch import Touch, agrees
 from calibrate.geometry import Transform
 from calibrate.results import (
     Arm,
@@ -199,10 +199,11 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict of the gates, or of the person who overrode one."""
-        if self.override is not None:
-            return "PASS WITH A REASON"
-        return "FAIL" if self.quality.failed else "PASS"
+        """FAIL by a gate; PASS WITH A REASON where a touch missed, or a person overrode something else."""
+        if self.quality.failed:
+            return "FAIL"
+        questioned = self.override is not None or not all(map(agrees, self.verification))
+        return "PASS WITH A REASON" if questioned else "PASS"
 
 
 def encode_calibration(calibration: Calibration) -> bytes:

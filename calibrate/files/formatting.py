@@ -119,7 +119,7 @@ VALIDITY_STYLES = {
 
 def summary(calibration: Calibration, validity: Validity | None = None) -> RenderableType:
     """Write a calibration for a rich console, 80 columns and more. `validity`: of the installed one."""
-    style = "bold red" if calibration.verdict == "FAIL" else "bold green"
+    style = {"PASS": "bold green", "FAIL": "bold red"}.get(calibration.verdict, "bold yellow")
     parts: list[RenderableType] = [Text(verdict_text(calibration), style=style)]
     if validity is not None:
         shown = f"Installed: {validity_text(validity)}"

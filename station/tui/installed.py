@@ -14,7 +14,6 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, Override, Verdict, read_calibration
 from calibrate.files.folders import calibrations_folder, current_version, validity_of
 from calibrate.files.install import objections_beside
-from calibrate.files.touch import agrees
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.versions import LogEntry, read_log, same_solve
@@ -168,13 +167,11 @@ class Result:
 
     @property
     def verdict(self) -> Verdict:
-        """PASS WITH A REASON: all gates pass, but installing needed a reason, or would."""
-        if self.calibration is None or self.calibration.verdict == "FAIL":
+        """PASS WITH A REASON also where all gates pass, but installing needed a reason, or would."""
+        if self.calibration is None:
             return "FAIL"
-        off = not all(map(agrees, self.calibration.verification))
-        if self.taken or off or self.objections:
-            return "PASS WITH A REASON"
-        return self.calibration.verdict
+        verdict = self.calibration.verdict
+        return "PASS WITH A REASON" if verdict == "PASS" and (self.taken or self.objections) else verdict
 
 
 def read_result(path: str) -> Result:

@@ -29,10 +29,9 @@ from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.touch_corners import run_touch_test
-from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, sentence, shortened
+from station.tui.words import MARKS, VERDICTS, Mark, dim, limit_bar, lines, mark, sentence, shortened
 
 NO_RESULT = "No result yet: F9 solves what was captured. On 5, Enter shows older ones."
-SHOWN = {"PASS": ("✓", "-pass"), "PASS WITH A REASON": ("▲", "-reason"), "FAIL": ("✗", "-fail")}
 BAR_CELLS, NAME_CELLS = 12, 27
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
 Row = tuple[tuple[Content, ...], str]
@@ -50,7 +49,8 @@ def verdict_lines(result: Result) -> Content:
     said = use_text(calibration)
     if result.verdict == "PASS WITH A REASON":
         said = accuracy_text(calibration)
-    rows = [Content.styled(f"{SHOWN[result.verdict][0]} {result.verdict}, {became or new}\n{said}", "bold")]
+    sign, _ = MARKS[VERDICTS[result.verdict]]
+    rows = [Content.styled(f"{sign} {result.verdict}, {became or new}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID
         rows.append(Content.styled(sentence(validity_text(validity)), "bold $warn" if doubted else ""))
@@ -203,7 +203,7 @@ class ResultScreen(StationScreen):
         self._drawn = result
         verdict = self.query_one("#verdict", Static)
         doubted = result is not None and result.installed and result.state.doubted
-        verdict.set_classes("" if result is None else "-reason" if doubted else SHOWN[result.verdict][1])
+        verdict.set_classes("" if result is None else "-look" if doubted else f"-{VERDICTS[result.verdict]}")
         verdict.update(Content(NO_RESULT) if result is None else verdict_lines(result))
         calibration = None if result is None else result.calibration
         self.query_one("#result").display = calibration is not None

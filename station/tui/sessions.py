@@ -15,7 +15,7 @@ from station.tui.installed import Kept
 from station.tui.jobs import check_session, recover_session, solve_session
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.words import facts, mark
+from station.tui.words import VERDICTS, facts, mark
 
 NO_SESSION = "No session is recorded yet: F5 plans one, shows its path and asks."
 COLUMNS = ("session", "state", "verdict", "views", "predicted error")
@@ -92,7 +92,7 @@ def _row(kept: Kept) -> tuple[Content, ...]:
     if found is not None:
         figure = figures(found)["error"]
         error = facts(("", figure.value, figure.about))
-        verdict = mark("failed" if found.verdict == "FAIL" else "done", found.verdict)
+        verdict = mark(VERDICTS[found.verdict], found.verdict)
         became = became or "solved, not installed"
     elif check is not None:
         verdict = mark("done" if check.passed else "failed", "PASS" if check.passed else "FAIL")

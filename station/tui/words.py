@@ -9,6 +9,7 @@ from typing import Literal
 from rich.text import Text
 from textual.content import Content
 
+from calibrate.files.calibration import Verdict
 from calibrate.files.formatting import predicted_error
 from station.cell.status import StationState, StationStatus
 
@@ -27,6 +28,7 @@ MARKS: dict[Mark, tuple[str, str]] = {
     "todo": ("○", "$faint"),
 }
 """Sign and colour: no state is told by colour alone."""
+VERDICTS: dict[Verdict, Mark] = {"PASS": "done", "PASS WITH A REASON": "look", "FAIL": "failed"}
 UNKNOWN = "–"
 """A number that is not known; never 0."""
 ERROR_SHOWN_MM = 100.0

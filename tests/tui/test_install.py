@@ -64,11 +64,12 @@ def test_there_is_one_verdict_in_three_states(result: Result, verdict: str) -> N
         assert verdict_lines(result).plain == result.problem
 
 
-def test_terminal_and_screen_say_the_same_figures() -> None:
+def test_terminal_and_screen_say_the_same_verdict_and_figures() -> None:
     printed = io.StringIO()
     Console(file=printed, width=200).print(summary(DOUBTED))
     screen = verdict_lines(Result("", DOUBTED)).plain + evidence(Result("", DOUBTED), DOUBTED).plain
     told = figures(DOUBTED)
+    assert f"{Result('', DOUBTED).verdict}: " in printed.getvalue()
     assert {"error", "gates", "views", "touch"} <= set(told)
     for figure in told.values():
         assert figure.value in printed.getvalue()

@@ -109,9 +109,10 @@ def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(
     with raises("reason-too-short", InstallError):
         install(path, tmp_path / "s", override="x")
     install(path, tmp_path / "s", override="line is down, checked with a pointer")
-    override = installed_calibration(tmp_path / "s").override
-    assert override.reason == "line is down, checked with a pointer"
-    assert "holdout_share" in override.overridden[0]
+    installed = installed_calibration(tmp_path / "s")
+    assert installed.override.reason == "line is down, checked with a pointer"
+    assert "holdout_share" in installed.override.overridden[0]
+    assert installed.verdict == "FAIL", "a reason mends no gate"
 
 
 def test_another_robot_camera_or_mount_is_refused(

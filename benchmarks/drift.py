@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.trials import in_processes, rows_of, table, trials
-from calibrate.check.drift import SHIFT_M, DriftCheck, find_shift
+from calibrate.check.drift import SHIFT_M, DriftCheck, check_drift
 from calibrate.check.production import NEWEST, EarlierPictures
 from calibrate.check.trend import entry_of, find_trend
 from calibrate.geometry import Array
@@ -102,7 +102,7 @@ def measure(task: tuple[str, Mount, float, int]) -> tuple[float, ...]:
         return [later_views(cell, creep[k], 100 * seed + first + k, VIEWS) for k in range(count)]
 
     def checks(of: list[ViewSet]) -> list[DriftCheck]:
-        return [find_shift(each, known) for each in of]
+        return [check_drift(each, known) for each in of]
 
     def trend(found: list[DriftCheck]) -> float:
         entries = [entry_of(check, 604800.0 * k, 1, "") for k, check in enumerate(found)]

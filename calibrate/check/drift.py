@@ -110,17 +110,12 @@ def stated_cell(calibration: Calibration) -> KnownCell:
     return KnownCell(state, covariance, scales, freedom, extent, None, None)
 
 
-def check_drift(views: ViewSet, calibration: Calibration, board: BoardSpec | None = None) -> DriftCheck:
-    """Test the calibration on new views (3 or more) of `board`, with board poses from its own lens.
+def check_drift(views: ViewSet, known: KnownCell) -> DriftCheck:
+    """Fit and test a shift of the camera on new views (3 or more), with board poses from the known lens.
 
     Raises TooFewViewsError, or BadViewsError where the views do not determine a shift or one is there twice.
     """
     require_no_copies(views)
-    return find_shift(views, known_cell(calibration, board))
-
-
-def find_shift(views: ViewSet, known: KnownCell) -> DriftCheck:
-    """Fit and test a shift of the camera against what is known. Raises as `check_drift` does."""
     if len(views) < FEWEST_FOR_DRIFT_CHECK:
         raise TooFewViewsError(
             views=len(views),

@@ -15,7 +15,7 @@ from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec
 
 FILE = "checks.jsonl"
-BY_CHANCE = 0.001
+_BY_CHANCE = 0.001
 """p from which a failed check is weak evidence, to be repeated before anything is done."""
 
 
@@ -53,6 +53,20 @@ class CheckEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     """`DriftCheck.evidence`: its right side, and the lower triangle of its information, row by row."""
     board: BoardSpec | None = None
     """None: the calibration's own. Only checks of one board make a trend, as another is of another size."""
+
+    @property
+    def advice(self) -> str:
+        """What to do after it."""
+        if self.trend is not None:
+            return self.trend.text
+        return "The installed calibration holds." if self.passed else advice_on_failure(self.p_value)
+
+
+def advice_on_failure(p_value: float) -> str:
+    """Say what to do after a check that failed."""
+    if p_value >= _BY_CHANCE:
+        return f"Weak evidence (p = {p_value:.3f}). Repeat the check."
+    return "Check the camera's bracket, and calibrate again."
 
 
 def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN_CAMERA) -> None:

@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from calibrate.check.drift import FEWEST_FOR_DRIFT_CHECK, POWER, DriftCheck, check_drift, known_cell
-from calibrate.check.history import BY_CHANCE, Trend, append_check, read_checks
+from calibrate.check.history import Trend, advice_on_failure, append_check, read_checks
 from calibrate.check.production import MOST_PICTURES, check_production
 from calibrate.check.same_cell import OtherCellError, require_same_cell
 from calibrate.check.trend import entry_of, find_trend
@@ -27,17 +27,18 @@ from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
 from calibrate.files.validity import ValidityReason, validity_text
 from calibrate.files.versions import installed_versions, same_solve
-from calibrate.job import JobOptions, prepare_views
+from calibrate.handeye.posterior import KnownCell
+from calibrate.job import JobOptions, PreparedViews, prepare_views
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.importers.dataset import DATASET_FILE
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
-from recordings.schema.messages import BoardSpec, SessionInfo
+from recordings.schema.messages import SessionInfo
 
 DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
 MOST_DISAGREEMENT = 3.0
-"""p below which a failure is told as certain: above it, repeating the check is advised."""
+"""`DriftFigures.disagreement` above which the views are called noisier than those of the calibration."""
 
 
 def drift_check(
@@ -87,14 +88,16 @@ def drift_check(
     info = prepared.recording.info
     version = None if held is None else held.version  # None: a named file, of which nothing is noted
     own, trend, validity, before, unnoted = False, None, None, list[bool](), None
+    if not production:
+        _require_this_cell(source, info, calibration, root, camera, version)
+    elif (mount := info.mount) != calibration.mount:
+        raise OtherCellError(where=source, differs="mounting", found=mount, calibrated=calibration.mount)
+    known = known_cell(calibration, prepared.loaded.board)
     if production:
-        if (mount := info.mount) != calibration.mount:
-            raise OtherCellError(where=source, differs="mounting", found=mount, calibrated=calibration.mount)
-        result = check_production(prepared.views, known_cell(calibration, prepared.loaded.board))
+        result = check_production(prepared.views, known)
         text = production_text(result, len(prepared.views))
     else:
-        _require_this_cell(source, info, calibration, root, camera, version)
-        result = check_drift(prepared.views, calibration, prepared.loaded.board)
+        result = check_drift(prepared.views, known)
         text = check_text(result, calibration)
         own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
     try:
@@ -103,7 +106,7 @@ def drift_check(
             verdict = _judged(result, info.name)
             validity = note_check(root, *verdict, _taken(info), camera=camera, version=version)
             if not production:
-                before, trend = _log(result, calibration, info, prepared.loaded.board, root, camera, version)
+                before, trend = _log(result, known, calibration, prepared, root, camera, version)
     except InstallError as problem:
         if problem.code == "other-version":
             raise
@@ -111,8 +114,8 @@ def drift_check(
     proves_nothing = own and result.passed
     if as_json:
         said = {"passed": result.passed and not own, "own_views": own, "validity": validity}
-        known = msgspec.structs.asdict(result) | said | {"trend": "" if trend is None else trend.text}
-        print_json(DriftCheckJson(**{name: known[name] for name in DriftCheckJson.__struct_fields__}))
+        told = msgspec.structs.asdict(result) | said | {"trend": "" if trend is None else trend.text}
+        print_json(DriftCheckJson(**{name: told[name] for name in DriftCheckJson.__struct_fields__}))
     elif proves_nothing:
         out.print(OWN_VIEWS.format(recording=source), style="yellow")
     else:
@@ -134,9 +137,9 @@ def drift_check(
 
 def _log(
     result: DriftCheck,
+    known: KnownCell,
     calibration: Calibration,
-    info: SessionInfo,
-    looked_at: BoardSpec,
+    prepared: PreparedViews,
     root: Path | None,
     camera: str,
     version: int,
@@ -145,12 +148,12 @@ def _log(
 
     A touch test makes a version of the same solve.
     """
-    versions = installed_versions(root, camera)
-    solve = {known.number for known in versions if same_solve(calibration, known.calibration)}
+    versions, info = installed_versions(root, camera), prepared.recording.info
+    solve = {made.number for made in versions if same_solve(calibration, made.calibration)}
     before = [entry for entry in read_checks(root, camera) if entry.generation in solve]
-    board = None if looked_at == calibration.board else looked_at
+    board = None if prepared.loaded.board == calibration.board else prepared.loaded.board
     entry = entry_of(result, _taken(info).timestamp(), version, info.name, board)
-    trend = find_trend([*before, entry], known_cell(calibration, board), board)
+    trend = find_trend([*before, entry], known, board)
     append_check(msgspec.structs.replace(entry, trend=trend), root, camera)
     return [one.passed for one in before], trend
 
@@ -208,11 +211,9 @@ def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
 def check_text(result: DriftCheck, calibration: Calibration) -> str:
     """Verdict, shift, power of the test, and what to do."""
     if not result.passed:
-        weak = f"Weak evidence (p = {result.p_value:.3f}). Repeat the check."
-        sure = "Check the camera's bracket, and calibrate again."
         text = (
             f"FAIL: camera shift {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° "
-            f"(p = {result.p_value:.1e}). {sure if result.p_value < BY_CHANCE else weak}"
+            f"(p = {result.p_value:.1e}). {advice_on_failure(result.p_value)}"
         )
     else:
         verdict = "PASS" if result.power >= POWER else "PASS, low sensitivity"

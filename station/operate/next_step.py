@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from calibrate.check.history import BY_CHANCE, CheckEntry
 from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch, agrees, touch_sigmas
 
@@ -15,7 +14,6 @@ class StepKind(StrEnum):
     """Next step after a procedure."""
 
     INSTALL = "install"
-    KEEP = "keep"
     RETAKE = "retake"
     LOOK_FOR = "look for"
 
@@ -57,18 +55,4 @@ def after_touches(touches: Sequence[Touch]) -> NextStep:
         StepKind.LOOK_FOR,
         f"a wrong pointer length or tool, or a board that was moved: the tip stood "
         f"{max(map(abs, worst.offset_mm)):.1f} mm beside corner {worst.corner}",
-    )
-
-
-def after_drift_check(entry: CheckEntry) -> NextStep:
-    """Recommend a step after a drift check."""
-    if entry.trend is not None:
-        return NextStep(StepKind.LOOK_FOR, entry.trend.text)
-    if entry.passed:
-        return NextStep(StepKind.KEEP, "the installed calibration holds")
-    if entry.p_value >= BY_CHANCE:
-        return NextStep(StepKind.RETAKE, f"the drift check. Its evidence is weak (p = {entry.p_value:.3f})")
-    return NextStep(
-        StepKind.LOOK_FOR,
-        "a loose camera or board mount. Tighten it, then capture and install a new calibration",
     )

@@ -23,7 +23,7 @@ from calibrate.files.validity import ValidityState, validity_text
 from calibrate.results import Gate
 from recordings.cli.console import open_in_browser
 from station.cell.session_folder import REPORT_FILE
-from station.operate.next_step import StepKind, after_drift_check, after_solve
+from station.operate.next_step import StepKind, after_solve
 from station.tui.installed import Result, local
 from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
@@ -95,11 +95,10 @@ def check_rows(result: Result, calibration: Calibration) -> list[Row]:
         kind: Mark = "done" if agrees(touch) else "failed"
         rows.append(_row(kind, name, f"{sigmas:.1f} σ", sigmas, LIMIT_SIGMAS, "≤ 3.0 σ", touch_text(touch)))
     for entry in reversed(result.state.drift if result.installed else ()):
-        step = after_drift_check(entry)
-        kind = "failed" if not entry.passed else "done" if step.kind is StepKind.KEEP else "look"
+        kind = "failed" if not entry.passed else "look" if entry.trend is not None else "done"
         name = time.strftime("drift check %d %b", time.localtime(entry.wall_s))
         value = f"{1000 * float(np.linalg.norm(entry.shift[:3])):.2f} mm"
-        rows.append(_row(kind, name, value, entry.statistic, entry.threshold, text=str(step)))
+        rows.append(_row(kind, name, value, entry.statistic, entry.threshold, text=entry.advice))
     return rows
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from calibrate.check.history import CheckEntry, append_check
+from calibrate.check.history import CheckEntry, Trend, append_check
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
 from station.cell.pose_plan import Plan, PlannedPose
@@ -16,7 +16,8 @@ from station.cell.status import StationState, StationStatus
 from station.protocol import verbs
 from station.tui import jobs
 from station.tui.dialogs import ConfirmMotion, JobScreen
-from station.tui.installed import read_installed
+from station.tui.installed import Installed, Result, read_installed
+from station.tui.result import check_rows
 from tests.tui.conftest import FakeLink, idle, in_session, opened, said, text_of, until
 from tests.tui.test_install import GOOD
 
@@ -79,6 +80,16 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
         asked = json.loads((installed / "asked").read_text())
         assert asked == ["drift-check", recording, "--root", str(installed / "root")]
         await until(pilot, lambda: any("holds" in line for line in app.screen.said))
+
+
+def test_what_each_check_found_is_a_row_that_tells_what_to_do() -> None:
+    held = CheckEntry(0.0, 1, "r", True, (0.0,) * 6, 1.0, 12.6)
+    weak, sure = (msgspec.structs.replace(held, passed=False, p_value=p_value) for p_value in (0.01, 1e-5))
+    creeping = msgspec.structs.replace(held, trend=Trend(0.4, 0.0, 40.0, 8))
+    drift = (sure, weak, creeping, held)
+    newest_first = check_rows(Result("", GOOD, Installed(GOOD, drift=drift)), GOOD)[-4:]
+    assert [cells[0].plain[0] for cells, _ in newest_first] == ["✓", "▲", "✗", "✗"]
+    assert len({advice for _, advice in newest_first}) == 4
 
 
 def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) -> None:

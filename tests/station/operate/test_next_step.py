@@ -1,16 +1,15 @@
-"""Every flow ends in a way on: install, keep, retake, or look for a cause."""
+"""Every solve ends in a way on: install, retake, or look for a cause."""
 
 from __future__ import annotations
 
 import msgspec
 import pytest
 
-from calibrate.check.history import CheckEntry, Trend
 from calibrate.files.calibration import Calibration, RejectedView
 from calibrate.files.touch import Touch
 from calibrate.results import Gate
 from recordings.schema.messages import CameraIdentity, RobotIdentity
-from station.operate.next_step import StepKind, after_drift_check, after_solve
+from station.operate.next_step import StepKind, after_solve
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
 
@@ -42,12 +41,3 @@ def failed(*names: str, rejected: tuple[RejectedView, ...] = ()) -> Calibration:
 def test_a_solve(calibration: Calibration, objections: tuple[str, ...], kind: StepKind, said: str) -> None:
     step = after_solve(calibration, objections)
     assert step.kind is kind and said in step.text
-
-
-def test_a_drift_check() -> None:
-    entry = CheckEntry(0.0, 1, "r", True, (0.0,) * 6, 1.0, 12.6)
-    assert after_drift_check(entry).kind is StepKind.KEEP
-    wanders = msgspec.structs.replace(entry, trend=Trend(0.4, 0.0, 40.0, 8))
-    assert after_drift_check(wanders).kind is StepKind.LOOK_FOR
-    for p_value, kind in ((1e-5, StepKind.LOOK_FOR), (0.01, StepKind.RETAKE)):
-        assert after_drift_check(msgspec.structs.replace(entry, passed=False, p_value=p_value)).kind is kind

@@ -22,7 +22,6 @@ from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.reprojection import bent_points
 from calibrate.lens.pnp import candidate_poses
 from calibrate.views import BoardView, ViewSet, observe_views
-from recordings.schema.messages import BoardSpec
 
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03
 """Distance within which the board counts as not moved since the calibration."""
@@ -40,7 +39,7 @@ class BoardNow:
     """(6, 6) of it: by the errors of X, of the corners, and of the arm at the image."""
 
 
-def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) -> BoardNow:
+def locate_board(calibration: Calibration, view: BoardView) -> BoardNow:
     """Locate the board in base from one image, by the installed X and the controller's flange.
 
     Raises BadViewsError where the tilt is ambiguous, where the board is still on the flange (eye-to-hand), or
@@ -53,7 +52,7 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
     if not in_hand:  # the board lies in base, whatever the arm does
         known = replace(known, scales=replace(known.scales, robot=np.full(2, _EXACTLY)))
     flange = view.base_from_flange if in_hand else np.eye(4)
-    readings = candidate_poses(view, known.mean.camera, board)
+    readings = candidate_poses(view, known.mean.camera, calibration.board)
     at = []
     for reading in readings:
         seen = replace(view, base_from_flange=flange, camera_from_board=reading.camera_from_board)
@@ -77,11 +76,10 @@ def _located(known: KnownCell, view: ViewSet) -> BoardNow:
     return BoardNow(found.state.Y, found.covariance[at, at])
 
 
-def found_points(calibration: Calibration, board: BoardSpec) -> Array:
-    """Return the board's points (k, 3) in its frame, with the estimated shape if it is the same board."""
-    points = board_points(board)
-    found = calibration.quality.board
-    if found is None or board != calibration.board:
+def found_points(calibration: Calibration) -> Array:
+    """Return the board's points (k, 3) in its frame, with the estimated shape."""
+    points, found = board_points(calibration.board), calibration.quality.board
+    if found is None:
         return points
     whole = BoardView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
     observed = observe_views(ViewSet(calibration.mount, (whole,), calibration.intrinsics.model))

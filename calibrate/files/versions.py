@@ -257,18 +257,20 @@ def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
 
 
 def note_installed(
-    root: Path | None, touches: Sequence[Touch], camera: str = MAIN_CAMERA
-) -> InstalledVersion:
+    root: Path | None, tested: Calibration, touches: Sequence[Touch]
+) -> InstalledVersion | None:
     """Add touch tests to the installed calibration, as a new version, because versions never change.
 
-    A failed corner puts it in doubt. Raises InstallError where no undamaged calibration is installed, or the
-    folder cannot be written.
+    A failed corner puts it in doubt. None where what is installed is not of the same solve as `tested`.
+    Raises InstallError where the folder cannot be written.
     """
-    folder = calibrations_folder(root, camera)
+    folder = calibrations_folder(root, tested.camera_name)
+    if not current_name(folder):
+        return None
     with locked(folder):
-        current = next((g for g in installed_versions(root, camera) if g.current), None)
-        if current is None or current.calibration is None:
-            raise InstallError("nothing-installed", folder=folder)
+        current = next((g for g in installed_versions(root, tested.camera_name) if g.current), None)
+        if current is None or current.calibration is None or not same_solve(tested, current.calibration):
+            return None
         calibration = _with_touches(current.calibration, touches)
         found = "; ".join(touch_text(touch) for touch in touches)
         before = read_validity(folder).get(current.number) or unrecorded(current.number)

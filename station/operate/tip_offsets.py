@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import getpass
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,12 +16,10 @@ import numpy as np
 from calibrate.boards.model import board_points
 from calibrate.check.board_now import BoardNow, found_points, locate_board, offset_covariance
 from calibrate.check.same_cell import require_same_cell
-from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.folders import VERSION_NAME
-from calibrate.files.install import installed_calibration
 from calibrate.files.touch import Touch
-from calibrate.files.versions import note_in_file, note_installed, same_solve
+from calibrate.files.versions import note_in_file, note_installed
 from calibrate.geometry import Array, inverse, transform_points
 from calibrate.views import BoardView
 from station.cell.config import Vector3
@@ -68,7 +65,7 @@ async def see_board(link: Client, file: Path) -> SeenBoard:
         raise RefusedError("no-pointer")
     points = board_points(calibration.board)[list(seen.corners)]
     view = BoardView(0, "touch test", np.array(seen.base_from_flange), points, np.array(seen.pixels))
-    now = await asyncio.to_thread(locate_board, calibration, view, calibration.board)
+    now = await asyncio.to_thread(locate_board, calibration, view)
     return SeenBoard(calibration, now, tip_m, pointer)
 
 
@@ -86,13 +83,13 @@ def read_touch(board: SeenBoard, corner: int, status: StationStatus | None) -> T
     flange = flange_pose(robot.state, robot.identity.tcp_offset)
     touching = transform_points(flange, np.array(board.tip_m))
     tip = transform_points(inverse(board.now.base_from_board), touching)
-    offset_mm = _offset_mm(corner, points[corner], tip)
-    at = found_points(board.calibration, board.calibration.board)[corner]
+    offset_m = _offset_m(corner, points[corner], tip)
+    at = found_points(board.calibration)[corner]
     covariance = offset_covariance(board.calibration, board.now, at, board.tip_m)
     return Touch(
         corner=corner,
         corner_mm=_mm(points[corner]),
-        offset_mm=_mm(offset_mm / 1000),
+        offset_mm=_mm(offset_m),
         sigma_mm=_mm(np.sqrt(np.diag(covariance))),
         found="read from the arm",
         who=getpass.getuser(),
@@ -101,16 +98,16 @@ def read_touch(board: SeenBoard, corner: int, status: StationStatus | None) -> T
     )
 
 
-def _offset_mm(corner: int, corner_m: Array, touching_m: Array) -> Array:
-    """Compute the offset (2,), mm, of the tip from the true corner if the calibration sent it there."""
+def _offset_m(corner: int, corner_m: Array, touching_m: Array) -> Array:
+    """Compute the offset (2,) of the tip from the true corner if the calibration sent it there."""
     height_m = abs(float(touching_m[2]))
     if height_m > _TOUCHING_M:
         raise RefusedError("not-touching", distance_m=height_m, limit_m=_TOUCHING_M)
-    offset = corner_m[:2] - touching_m[:2]
-    beside_m = float(np.linalg.norm(offset))
+    offset_m: Array = corner_m[:2] - touching_m[:2]
+    beside_m = float(np.linalg.norm(offset_m))
     if beside_m > _BESIDE_M:
         raise RefusedError("other-corner", corner=corner, distance_m=beside_m, limit_m=_BESIDE_M)
-    return np.asarray(1000 * offset)
+    return offset_m
 
 
 def _mm(metres: Array) -> tuple[float, float]:
@@ -126,11 +123,7 @@ def note_touches(root: Path, file: Path, touches: list[Touch]) -> str:
     kept = VERSION_NAME.fullmatch(file.name)
     noted = read_calibration(file) if kept else note_in_file(file, touches)
     where = [] if kept else [f"into {file}"]
-    now = None
-    with suppress(CalibrationError):
-        now = installed_calibration(root, noted.camera_name)
-    if same_solve(noted, now):
-        made = note_installed(root, touches, noted.camera_name)
+    if made := note_installed(root, noted, touches):
         where.append(f"into the installed calibration, now version {made.number}")
     said = " and ".join(where) or "nowhere: another one is installed by now"
     return f"Written {said}. {after_touches(touches)}."

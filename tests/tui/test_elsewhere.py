@@ -96,7 +96,7 @@ async def test_the_result_says_what_is_installed_and_who_took_it_back(link: Fake
 
 def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
     put(root, "s-1")
-    note_installed(root, [OFF])
+    note_installed(root, read_installed(root).now, [OFF])
     assert read_installed(root).word(solve_of(root, "s-1")) == "INSTALLED, in doubt"
     put(root, "s-2")
     assert {c.provenance.session for c in read_installed(root).earlier} == {"s-1"}

@@ -122,7 +122,7 @@ async def test_going_back_names_both_and_asks(link: FakeLink, calibration: Path)
         for path, made in ((calibration.with_name("a.yaml"), GOOD), (calibration.with_name("b.yaml"), LATER)):
             write_calibration(made, path)
             install(path, calibration.parents[2], cell="simulated")
-        note_installed(calibration.parents[2], [OFF])  # a generation more, of the same solve
+        note_installed(calibration.parents[2], LATER, [OFF])  # a generation more, of the same solve
         await pilot.press("b")
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         body = str(pilot.app.screen.query_one("#confirm-body", Static).render())

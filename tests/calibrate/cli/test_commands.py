@@ -157,7 +157,7 @@ def test_a_touch_test_does_not_begin_the_trend_anew(real_file: Path, tmp_path: P
         right = tuple(1e4 * week + value for value in first.right)
         append_check(msgspec.structs.replace(first, wall_s=first.wall_s - 6e5 * week, right=right), root)
     touch = Touch(0, (0.0, 0.0), (0.1, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01")
-    note_installed(root, [touch])
+    note_installed(root, read_calibration(real_file), [touch])
     assert json.loads(run("drift-check", new, *check, cwd=tmp_path).stdout)["trend"]
     anew = msgspec.structs.replace(read_calibration(real_file), created="2026-01-02T00:00:00+00:00")
     write_calibration(anew, tmp_path / "anew.yaml")

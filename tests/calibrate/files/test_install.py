@@ -261,11 +261,11 @@ def test_going_back_passes_the_checks_by_hand_of_the_same_solve(make_file, tmp_p
     """Who finds it off by hand and goes back must not get the same one without the finding."""
     first = make_file()
     install(first, tmp_path)
-    note_installed(tmp_path, [MISSED])
+    note_installed(tmp_path, read_calibration(first), [MISSED])
     with raises("nothing-older", InstallError):
         rollback(tmp_path)
-    install(make_file(0.001), tmp_path)
-    note_installed(tmp_path, [MISSED])
+    install(second := make_file(0.001), tmp_path)
+    note_installed(tmp_path, read_calibration(second), [MISSED])
     assert [g.number for g in installed_versions(tmp_path)] == [1, 2, 3, 4]
     assert rollback(tmp_path).number == 2
 

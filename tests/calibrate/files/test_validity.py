@@ -136,11 +136,12 @@ def test_what_is_rolled_back_to_is_unverified_or_still_in_doubt(root: Path, make
 
 
 def test_a_missed_corner_puts_it_in_doubt_and_a_met_one_clears_that(root: Path) -> None:
-    assert note_installed(root, [touch(0.1)]).validity.state is V
-    note_installed(root, [touch(0.1), touch(5.0)])
+    tested = installed_calibration(root)
+    assert note_installed(root, tested, [touch(0.1)]).validity.state is V
+    note_installed(root, tested, [touch(0.1), touch(5.0)])
     found = load_installed(root, require_valid=False)
     assert (found.version, found.validity.state, found.validity.reason.code) == (3, D, "touch-test")
-    note_installed(root, [touch(0.2)])
+    note_installed(root, tested, [touch(0.2)])
     assert load_installed(root).validity.state is V
 
 
@@ -156,13 +157,14 @@ def test_touches_stay_in_a_file_that_is_installed_and_make_a_version_of_what_is(
     own_file: Path, tmp_path: Path
 ) -> None:
     before, root, good = read_calibration(own_file), tmp_path / "s", touch(0.1)
-    with raises("nothing-installed", InstallError):
-        note_installed(root, [good])
+    assert note_installed(root, before, [good]) is None and not root.exists()
     note_in_file(own_file, [good])
     note_in_file(own_file, [good])
     assert read_calibration(own_file) == msgspec.structs.replace(before, verification=[good, good])
     install(own_file, root)
-    note_installed(root, [good])
+    another = msgspec.structs.replace(before, created="2026-01-02T00:00:00+00:00")
+    assert note_installed(root, another, [good]) is None
+    note_installed(root, before, [good])
     assert installed_calibration(root).verification == [good] * 3
     assert [g.number for g in installed_versions(root)] == [1, 2]
     assert read_log(root)[-1].action == "verify"

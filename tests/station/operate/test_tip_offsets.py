@@ -155,7 +155,7 @@ def test_the_predicted_offset_is_what_repetitions_show() -> None:
             return np.r_[rng.normal(0, ROBOT_M, 3), rng.normal(0, ROBOT_RAD, 3)]
 
         view = seen_from(truth, E, board, rng, told=perturb(E, robot_error()))
-        now = locate_board(calibration, view, truth.board)
+        now = locate_board(calibration, view)
         covariance = offset_covariance(calibration, now, corner, POINTER.tip_m)
         # The arm is sent where the tip would touch the corner, and misses by its own error.
         target = transform_points(now.base_from_board, corner)
@@ -175,12 +175,12 @@ def test_a_board_still_on_the_flange_is_noticed() -> None:
     E = forward(MODELS["UR10"], truth.start_joints_rad)
     view = seen_from(truth, E, E @ np.array(truth.board_place))
     with raises("board-on-flange"):
-        locate_board(calibration_of(truth, ROBOT, CAMERA), view, truth.board)
+        locate_board(calibration_of(truth, ROBOT, CAMERA), view)
 
 
 def test_a_moved_board_is_found_where_it_is() -> None:
     truth = make_cell()
     E, moved = forward(MODELS["UR10"], truth.start_joints_rad), np.array(truth.board_place)
     moved[:3, 3] += [0.03, -0.02, 0.01]
-    now = locate_board(calibration_of(truth, ROBOT, CAMERA), seen_from(truth, E, moved), truth.board)
+    now = locate_board(calibration_of(truth, ROBOT, CAMERA), seen_from(truth, E, moved))
     assert now.base_from_board == pytest.approx(moved, abs=1e-6)

@@ -78,6 +78,12 @@ def new_session_folder(root: Path, cell: str) -> Path:
     raise StationError("session-folder", folder=sessions, reason="it has too many of this second")
 
 
+def solve_arguments(recording: str, folder: str) -> tuple[str, ...]:
+    """Arguments of `calibrate`: result and report into the session's folder, where the screen finds them."""
+    output, report = (str(Path(folder) / name) for name in (CALIBRATION_FILE, REPORT_FILE))
+    return ("solve", recording, "-o", output, "--report", report)
+
+
 def require_writable(root: Path) -> None:
     """Write a file below `root` and remove it. Raises OSError."""
     probe = root / ".write-test"

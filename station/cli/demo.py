@@ -22,7 +22,7 @@ from recordings.files import state_root
 from recordings.reader import open_recording
 from recordings.schema.messages import Matrix4, Mount
 from station.cell.errors import ConfigError, StationError
-from station.cell.session_folder import CALIBRATION_FILE, REPORT_FILE
+from station.cell.session_folder import CALIBRATION_FILE, REPORT_FILE, solve_arguments
 from station.cell.status import StationStatus
 from station.cli.console import AsJson, Headless, OpenReport, err, open_report, out, print_json
 from station.cli.daemon import own_daemon
@@ -163,14 +163,11 @@ def _solved(outcome: StationStatus) -> Calibration:
         raise StationError(
             "demo-unfinished", captured=session.captured, poses=len(session.poses), saved=saved, why=why
         )
-    folder = Path(session.folder)
-    calibration, report = str(folder / CALIBRATION_FILE), str(folder / REPORT_FILE)
-    command = [sys.executable, "-m", "calibrate.cli", "solve", session.recording]
-    command += ["--output", calibration, "--report", report]
+    command = [sys.executable, "-m", "calibrate.cli", *solve_arguments(session.recording, session.folder)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode not in (0, _GATE_FAILED):
         raise StationError("demo-solve-failed", exit_code=done.returncode, said=done.stderr.strip())
-    return read_calibration(Path(calibration))
+    return read_calibration(Path(session.folder) / CALIBRATION_FILE)
 
 
 def truth_error(recording: Path, found: Matrix4) -> tuple[float, float]:

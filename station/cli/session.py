@@ -20,6 +20,7 @@ from rich.text import Text
 from recordings.cli.console import progress_bar
 from station.cell.errors import RefusedError, StationError
 from station.cell.pose_plan import Plan
+from station.cell.session_folder import solve_arguments
 from station.cell.socket_folder import default_socket
 from station.cell.status import CHECK_VIEWS, MotionPreview, StationState, StationStatus
 from station.cli.console import AsJson, Headless, Socket, err, out, print_json
@@ -328,8 +329,8 @@ def _finish(outcome: StationStatus, as_json: bool) -> None:
         for pose in session.poses:
             if pose.state == "failed":
                 out.print(f"Not captured: pose {pose.index + 1}. {pose.reason}")
-        judge = check_arguments(session.recording, session.folder)
-        next_step = judge if session.check else ("solve", session.recording)
+        of_session = check_arguments if session.check else solve_arguments
+        next_step = of_session(session.recording, session.folder)
         out.print(f"Next: calibrate {shlex.join(next_step)}")
     else:
         err.print(Text.assemble((outcome.state.value, "bold"), f": {outcome.reason}"))

@@ -14,7 +14,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.install import Cell, install, rollback, withdraw
 from calibrate.files.validity import ValidityState
 from calibrate.files.versions import InstalledVersion, before_current, installed_versions, read_log
-from station.cell.session_folder import CALIBRATION_FILE, REPORT_FILE
+from station.cell.session_folder import CALIBRATION_FILE, solve_arguments
 from station.operate.drift_check import check_arguments, recorded, start_drift_check
 from station.operate.motion import Approve
 from station.tui.daemon_link import DaemonLink
@@ -29,11 +29,10 @@ NO_VERDICT = "Another session began: the drift check has no verdict. On 5, k jud
 
 async def solve_session(link: DaemonLink, recording: str, folder: str) -> None:
     """Solve, and show the result."""
-    output, report = (str(Path(folder) / name) for name in (CALIBRATION_FILE, REPORT_FILE))
-    what = ("solve", recording, "-o", output, "--report", report)
+    what = solve_arguments(recording, folder)
     code = await link.ask_person(JobScreen(f"Solving {Path(folder).name}", "calibrate.cli", *what))
     if code in (0, 4):
-        await link.app.show_result(output)
+        await link.app.show_result(str(Path(folder) / CALIBRATION_FILE))
 
 
 async def recover_session(link: DaemonLink, folder: str) -> None:

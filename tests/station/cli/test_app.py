@@ -117,9 +117,11 @@ def test_a_session_with_loss_names_what_is_missing_and_ends_with_3(
     missed = PoseStatus(1, "p02", state="failed", reason="the board is not seen")
     poses = (PoseStatus(0, "p01", state="done"), missed)
     with pytest.raises(typer.Exit) as end:
-        session._finish(StationStatus(session=SessionStatus(poses=poses, captured=1, recording="/r")), False)
+        ended = SessionStatus(poses=poses, captured=1, recording="/s/r", folder="/s")
+        session._finish(StationStatus(session=ended), False)
     said = capsys.readouterr().out
-    assert end.value.exit_code == 3 and f"pose 2. {missed.reason}" in said and "calibrate solve /r" in said
+    assert end.value.exit_code == 3 and f"pose 2. {missed.reason}" in said
+    assert "calibrate solve /s/r -o /s/calibration.yaml" in said, "where the screen looks for it"
 
 
 @pytest.mark.parametrize("headless", [True, False])

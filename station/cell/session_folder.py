@@ -32,7 +32,6 @@ _UNDER_WAY = re.compile(rb'"state":"(moving|settling|capturing|writing)"')
 class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     """`session.json`."""
 
-    name: str
     source: Source
     plan: Plan
     poses: tuple[PoseStatus, ...]
@@ -43,7 +42,6 @@ class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     check: bool = False
     """True: a drift check of the installed calibration."""
     sealed: bool = False
-    recording: str = ""
 
 
 class SessionSummary(msgspec.Struct, frozen=True):

@@ -57,7 +57,6 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     predicted_sigma_mm: float | None = None
     estimated_sigma_mm: float | None = None
     """Predicted error after this pose, by the images so far (`predicted_sigma_mm`: when planned)."""
-    coverage: float | None = None
     base_from_flange: Matrix4 | None = None
     """Expected flange pose."""
     kept: bool = False
@@ -179,8 +178,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    present: bool = False
     identity: str = ""
+    """Empty: there is no box, or it was not opened yet."""
     pulses: int = 0
     """Pulses so far; the frames that belong to them: `CameraCounts.paired`"""
 
@@ -251,8 +250,6 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
         """Fewest views by hand that are enough."""
         return CHECK_VIEWS if self.check else FEWEST_BY_HAND
 
-    source: Source = "real"
-
 
 class LeaseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     holder: str = ""
@@ -307,8 +304,8 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """The code of `reason`, for programs."""
     pending: str = ""
     """Request that waits for the end of the pose under way: to pause or to finish."""
-    simulated: bool = False
-    playback: bool = False
+    source: Source = "real"
+    """Of the cell: anything but `real` is marked everywhere."""
     cell: str = ""
     mount: Mount = "eye-in-hand"
     robot: RobotStatus = RobotStatus()

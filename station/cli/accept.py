@@ -81,7 +81,7 @@ def accept_command(
 
 async def _accept(socket: Path | None, joint: int, speed_m_s: float, quiet: bool) -> Acceptance:
     async with attended(socket, headless=quiet, camera=False) as shell:
-        if (await shell.status()).playback:
+        if (await shell.status()).source == "playback":
             raise RefusedError("playback")
         if quiet and not shell.simulated:
             raise no_terminal("--json prompts nobody, and is for simulated cells only.")

@@ -55,7 +55,7 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     words = ["camera not connected"]
     if camera.connected:
         words = [camera.model, f"{camera.counts.missing} frames dropped"]
-    if trigger.present:
+    if trigger.identity:
         words.append(f"trigger {trigger.pulses} pulses, {camera.counts.paired} frames")
     out.print(", ".join(words))
     if session.recording:
@@ -63,8 +63,8 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
 
 
 def _print_state(status: StationStatus) -> None:
-    marks = " SIMULATED" if status.simulated else " PLAYBACK" if status.playback else ""
-    out.print(Text.assemble((status.state.value, "bold"), f"{marks}  {status.reason}"))
+    mark = "" if status.source == "real" else f" {status.source.upper()}"
+    out.print(Text.assemble((status.state.value, "bold"), f"{mark}  {status.reason}"))
 
 
 def stop_command(socket: Socket = None) -> None:

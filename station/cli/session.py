@@ -140,7 +140,7 @@ async def attended(
     # Ctrl-Z would leave the arm moving, and this command unable to hear Ctrl-C: it means the same.
     asyncio.get_running_loop().add_signal_handler(signal.SIGTSTP, signal.raise_signal, signal.SIGINT)
     async with Client(path) as client:
-        simulated = (await wait_until_idle(client, camera=camera)).simulated
+        simulated = (await wait_until_idle(client, camera=camera)).source == "simulated"
         shell = Attended(path, client, simulated, headless, approved, quiet)
         try:
             yield shell

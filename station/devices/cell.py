@@ -43,10 +43,6 @@ class Cell:
     ended: Callable[[], None] = lambda: None
     """Called after the devices are closed, to end the processes of a simulated cell."""
 
-    @property
-    def simulated(self) -> bool:
-        return self.source == "simulated"
-
     def require_mover(self) -> Mover:
         """Return what moves the arm. RefusedError where a person does."""
         if self.mover is None:

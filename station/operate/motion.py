@@ -48,7 +48,7 @@ async def wait_until_idle(link: Client, *, camera: bool = True) -> StationStatus
     with contextlib.suppress(TimeoutError):
         async with timeout(CONNECT_WAIT_S):
             async for status in link.statuses():
-                told = status.playback or status.robot.connected
+                told = status.source == "playback" or status.robot.connected
                 there = status.camera.connected or not camera
                 if status.state is not StationState.DISCONNECTED and there and told:
                     return status

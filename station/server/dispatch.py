@@ -24,7 +24,7 @@ class SessionDispatcher:
     def __init__(self, session: Session, see: Callable[[int], Process | None] = process) -> None:
         self._session = session
         cell = session.context.cell
-        self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
+        self._rule = ApprovalRule(cell.config.approval, cell.source == "simulated", see)
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
         """User id → name, once looked up."""

@@ -129,7 +129,7 @@ async def _write(context: SessionContext, index: int, image: Image, view: View, 
     recording.require_open().view(view)
     await recording.sync()
     if sighting is not None:
-        queue.note(index, corners=sighting.status.corners, coverage=sighting.status.coverage)
+        queue.note(index, corners=sighting.status.corners)
         context.store.update(detection=sighting.status)
         flange = np.array(view.base_from_flange)
         context.seen.pop(index, None)  # the newest comes last

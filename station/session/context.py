@@ -156,20 +156,13 @@ class SessionContext:
     def forget_session(self, check: bool = False) -> None:
         """Clear the last session from the status when a session begins; `check`: as a drift check."""
         self.seen.clear()
-        self.store.update_session(
-            name="",
-            folder="",
-            recording="",
-            check=check,
-            elapsed_s=0.0,
-            remaining_s=None,
-        )
+        self.store.update(session=SessionStatus(check=check))
 
     def show_poses(self, current: int | None = None) -> None:
         """Update the status from queue and recording. `current`: number of the pose under way."""
         queue, recording = self.queue, self.recording
         if queue is None:
-            self.store.update(session=SessionStatus(source=self.cell.source))
+            self.store.update(session=SessionStatus())
             return
         named = {"name": recording.name, "folder": str(recording.folder)} if recording else {}
         self.store.update_session(
@@ -177,7 +170,6 @@ class SessionContext:
             working_distance_m=queue.plan.working_distance_m,
             current=current,
             captured=queue.done,
-            source=self.cell.source,
             **named,
         )
 

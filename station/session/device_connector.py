@@ -60,7 +60,7 @@ class DeviceConnector:
     async def _open_trigger(self) -> None:
         if (trigger := self._context.cell.trigger) is not None:
             identity = await trigger.open()
-            self._context.store.update(trigger=TriggerStatus(present=True, identity=identity))
+            self._context.store.update(trigger=TriggerStatus(identity))
             self._found("trigger", identity)
 
     def _found(self, device: str, identity: str) -> None:

@@ -9,7 +9,6 @@ from station.cell.errors import SafetyStopError, StationError
 from station.cell.status import StationState
 from station.session.context import RunRequests, SessionContext
 from station.session.recording import to_the_end
-from station.session.threads import DISK
 
 log = logging.getLogger(__name__)
 
@@ -43,9 +42,7 @@ async def _seal(context: SessionContext) -> None:
     recording, queue = context.require_recording(), context.loaded()
     if recording.recorder is None:  # nothing was added since the crash
         await context.recover_segments(recording)
-        await recording.save_state(queue, path := await DISK.run(recording.whole))
-    else:
-        path = await recording.seal(queue)
+    path = await recording.seal(queue)
     context.recording = None
     context.store.update_session(recording=str(path), remaining_s=0.0)
     # The most important first, as a narrow screen cuts the end.

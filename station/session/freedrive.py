@@ -106,7 +106,6 @@ class FreedriveCapture:
             store.enter(context.resting)
         Record.require(store.state)  # STOP, or the end of freedrive, may have come in between
         store.enter(StationState.FREE_DRIVE, _GUIDE)
-        context.show_poses()
 
     async def _open_recording(self, check: bool) -> None:
         context, new = self._context, self._context.recording is None
@@ -118,6 +117,7 @@ class FreedriveCapture:
         if new:
             context.forget_session(check=check)
         context.queue = queue
+        context.show_poses()
 
     def end(self) -> None:
         """End freedrive: to paused; the recording stays open."""

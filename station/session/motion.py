@@ -167,7 +167,7 @@ async def _warnings(context: SessionContext, state: RobotState) -> list[str]:
         warnings.append(f"the speed slider stands at {100 * slider:.0f} %")
     if trouble := await DISK.run(context.cell.acceptance_trouble, context.root):
         warnings.append(f"the arm's stops are {trouble}")
-    if context.cell.simulated:
+    if context.cell.source == "simulated":
         warnings.append("SIMULATED cell: nothing real moves")
     if context.cell.source == "playback":
         warnings.append("PLAYBACK of a recording: no arm moves")

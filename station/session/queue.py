@@ -125,12 +125,10 @@ def refused(code: str, index: int) -> RefusedError:
 
 def _planned(plan: Plan, index: int) -> PoseStatus:
     pose, sigma_m = plan.poses[index], plan.predicted_error_m(index)
-    view = pose.view
     return PoseStatus(
         index,
         pose.name,
         why=pose.why,
         predicted_sigma_mm=None if sigma_m is None else round(1000 * sigma_m, 4),
-        coverage=None if view is None else round(view.coverage, 4),
         base_from_flange=pose.base_from_flange,
     )

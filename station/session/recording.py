@@ -208,21 +208,19 @@ class SessionRecording:
         """Check the free space before a pose. RecordingError tells how much to free."""
         require_free_space(self.folder, self._cell.config.capture.free_space_bytes)
 
-    async def save_state(self, queue: PoseQueue, recording: Path | None = None) -> None:
-        """Save what a restarted daemon needs; `recording`: path once it is finished. Raises RecordingError.
+    async def save_state(self, queue: PoseQueue, sealed: bool = False) -> None:
+        """Save what a restarted daemon needs; `sealed`: the recording is finished. Raises RecordingError.
 
         Writes in a thread, as a slow fsync must not delay the arm's heartbeat.
         """
         state = SessionState(
-            name=self.name,
             source=self._cell.source,
             plan=queue.plan,
             poses=queue.statuses,
             parts=self.segment,
             elapsed_s=round(self.elapsed_s, 1),
             check=self._check,
-            sealed=recording is not None,
-            recording=str(recording or ""),
+            sealed=sealed,
         )
         async with self._saving:
             await to_the_end(DISK.run(self._write_state, state))  # complete it, so that states stay in order
@@ -238,13 +236,13 @@ class SessionRecording:
             raise RecordingError("disk-write", folder=self.folder, reason=error.strerror) from error
 
     async def seal(self, queue: PoseQueue) -> Path:
-        """Finish the file; return the path of the recording: the file, or the folder of several."""
-        # Shielded: cancelling this call must not cancel the writer's thread.
-        await asyncio.shield(asyncio.wrap_future(self.require_open().finish()))
-        self.recorder = None
-        whole = await DISK.run(self.whole)
-        await self.save_state(queue, whole)
-        return whole
+        """Finish the file, if one is open; return the recording: the file, or the folder of several."""
+        if self.recorder is not None:
+            # Shielded: cancelling this call must not cancel the writer's thread.
+            await asyncio.shield(asyncio.wrap_future(self.recorder.finish()))
+            self.recorder = None
+        await self.save_state(queue, sealed=True)
+        return await DISK.run(self.whole)
 
     def abandon(self) -> None:
         """Close after a write error; the `.part` file stays for `recordings recover`.

@@ -59,10 +59,8 @@ class Session:
     """Session of a cell, below the folder `root`; independent of sockets and screens."""
 
     def __init__(self, cell: Cell, root: Path) -> None:
-        config, playback = cell.config, cell.source == "playback"
-        self.store = StatusStore(
-            StationStatus(simulated=cell.simulated, playback=playback, cell=config.name, mount=config.mount)
-        )
+        config = cell.config
+        self.store = StatusStore(StationStatus(source=cell.source, cell=config.name, mount=config.mount))
         monitor = StillnessMonitor(config.stillness)
         self.context = SessionContext(cell, self.store, Workers(start_worker, warm_up), monitor, root)
         # This clock goes on while the computer sleeps: no offer outlives that.
@@ -247,9 +245,8 @@ class Session:
         if motion.stop_test is None:
             if context.recording is None:
                 context.forget_session(check=motion.purpose is Purpose.DRIFT_CHECK)
-            if motion.queue is not context.queue:
-                context.queue = motion.queue
-                context.show_poses()
+            context.queue = motion.queue
+            context.show_poses()
         self.store.enter(StationState.CHECKING)
         self.store.event("approved", go.said, approval_sha256=go.preview.approval_sha256)
         self._run = asyncio.create_task(run.drive())

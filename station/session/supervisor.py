@@ -89,9 +89,9 @@ class Monitor:
 
     def _trigger(self) -> TriggerStatus:
         shown, box = self._context.store.status.trigger, self._context.cell.trigger
-        if box is None or not shown.present:
+        if box is None or not shown.identity:
             return shown
-        return msgspec.structs.replace(shown, pulses=box.pulses)
+        return TriggerStatus(shown.identity, box.pulses)
 
     async def watch_files(self) -> None:
         """Read files for the daemon's life, in a thread: a hanging disk must not delay the heartbeat."""

@@ -150,7 +150,8 @@ class StationApp(LivePageApp[None], DaemonApp):
             self.bell()
         if before is None:  # connected, perhaps to another daemon than before
             self.known = replace(self.known, configuration=self.link.client.config)
-            if not self._greeted and status.state is StationState.DISCONNECTED and not status.playback:
+            lost = status.state is StationState.DISCONNECTED and status.source != "playback"
+            if lost and not self._greeted:
                 self.switch_mode("connect")
             self._greeted = True
             if not self.known.works:

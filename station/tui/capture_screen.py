@@ -63,7 +63,7 @@ class CaptureScreen(StationScreen):
         error.border_subtitle = "" if session.check else ERROR_LEGEND
         self.query_one("#picture").border_title = (
             f"Camera  {status.camera.model}"
-            if status.camera.connected or status.playback
+            if status.camera.connected or status.source == "playback"
             else "Camera: not connected"
         )
         self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")

@@ -119,11 +119,14 @@ def _bar_parts(known: Known, title: str) -> Iterator[Content]:
         yield dim("  to stop the arm use the pendant")
         return
     chip, style = state_of(status)
-    playback = Content.styled(" PLAYBACK, no live arm ", "bold $sim on $simbg")
-    yield playback + dim(f" {chip} ") if status.playback else Content.styled(f" {chip} ", style)
-    if status.simulated:
+    if status.source == "playback":
+        yield Content.styled(" PLAYBACK, no live arm ", "bold $sim on $simbg") + dim(f" {chip} ")
+        yield dim(f"  {status.robot.model}")
+        return
+    yield Content.styled(f" {chip} ", style)
+    if status.source == "simulated":
         yield Content.styled(" SIMULATED ", "bold $sim on $simbg")
-    yield from [dim(f"  {status.robot.model}")] if status.playback else _robot_parts(status)
+    yield from _robot_parts(status)
 
 
 def _robot_parts(status: StationStatus) -> Iterator[Content]:

@@ -66,7 +66,8 @@ async def install_result(link: DaemonLink, result: Result, calibration: Calibrat
     body = f"Session {session} becomes what every program of this cell reads. b undoes it."
     if not await link.ask_person(Confirm("Install this calibration?", body, yes="Install")):
         return
-    cell: Cell = "simulated" if link.known.live is not None and link.known.live.simulated else "real"
+    live = link.known.live
+    cell: Cell = "simulated" if live is not None and live.source == "simulated" else "real"
     config = link.client.config
     oldest = None if config is None else config.validity.max_age_days
     put = partial(install, Path(result.path), state_root(result.path), cell=cell, max_age_days=oldest)

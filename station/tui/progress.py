@@ -74,7 +74,7 @@ def progress_lines(known: Known, width: int, height: int) -> Content:
         else (("", duration(session.remaining_s), "left"),)
     )
     head = facts(("", str(saved), f"of {len(session.poses)} saved"), *left)
-    if status.playback:
+    if status.source == "playback":
         head += Content.styled("   played, no arm moves", "$sim")
     why = "" if pose is None else f"{pose.name}: {pose.why}" if pose.why else pose.name
     return lines(head, pose_line(status), dim(why), *chips(session, width, max(1, height - 3)))

@@ -139,7 +139,7 @@ def _now(made: list[Step], status: StationStatus, known: Known) -> int:
 
 def _connect(known: Known, status: StationStatus) -> Step:
     devices = [status.robot.connected, status.camera.connected]
-    devices += [True] if status.trigger.present else []
+    devices += [True] if status.trigger.identity else []
     if known.missing is not None:
         return Step("connect", "look", f"{known.missing.name} missing")
     ready = sum(devices)
@@ -302,7 +302,8 @@ def _with_result(result: Result, status: StationStatus) -> Action:
     if result.installed:
         return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="result")
     if step.kind is StepKind.INSTALL:
-        touch = "" if calibration.verification or status.simulated else " Or h: a touch test first."
+        needless = calibration.verification or status.source == "simulated"
+        touch = "" if needless else " Or h: a touch test first."
         return Action("i", "Install", f"PASS: {step.text}.{touch}", at="result")
     if step.kind is StepKind.RETAKE:
         return Action("n", "Plan and retake", step.text, at="plan", look=True)

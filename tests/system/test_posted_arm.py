@@ -105,7 +105,8 @@ async def test_views_by_hand_become_an_installed_calibration_that_knows_the_arm(
             await status_when(client, lambda s: s.cause == "post-nobody")
             hand.place = plan.poses[0]
             status = await status_when(client, lambda s: s.state is StationState.IDLE)
-            assert status.robot.by_hand and status.simulated and status.robot.model == "arm of a friend"
+            assert status.source == "simulated"
+            assert status.robot.by_hand and status.robot.model == "arm of a friend"
             await client.call(Freedrive(on=True), timeout_s=60.0)
             for number, place in enumerate(plan.poses):
                 hand.place = place

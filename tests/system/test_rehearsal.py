@@ -76,7 +76,7 @@ async def test_nothing_of_the_configuration_is_connected_to(
     with rehearsing(config, tmp_path) as control:
         async with Client(control) as client:
             status = await wait_until_idle(client)
-            assert status.simulated and status.state is StationState.IDLE
+            assert status.source == "simulated" and status.state is StationState.IDLE
             assert client.config is not None and client.config.robot.host not in (ROBOT, "")
             assert status.robot.speed_limit_m_s == 0.2
             await client.call(MakePlan(4, 0), timeout_s=60.0)

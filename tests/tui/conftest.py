@@ -147,7 +147,7 @@ def idle(state: StationState = StationState.IDLE, reason: str = "") -> StationSt
     return StationStatus(
         state=state,
         reason=reason,
-        simulated=True,
+        source="simulated",
         robot=RobotStatus(RobotIdentity("UR10"), make_state(0), ArmCondition(safety="NORMAL"), remote=True),
         camera=CameraStatus(CameraIdentity(model="MER-131-75GM")),
         session=SessionStatus(name="s-1", poses=poses),

@@ -121,7 +121,7 @@ def test_who_lost_the_daemon_in_a_session_reads_how_many_poses_are_safe() -> Non
 @pytest.mark.parametrize("state", [StationState.IDLE, StationState.DISCONNECTED, StationState.MOVING])
 def test_the_bar_says_not_accepted_on_the_smallest_screen(width: int, state: StationState) -> None:
     status = with_robot(idle(state), not_accepted="not accepted: its stops were never tested")
-    status = msgspec.structs.replace(status, simulated=False)
+    status = msgspec.structs.replace(status, source="real")
     assert "not accepted" in bar_line(Known(status), "Connect", width).plain
 
 

@@ -80,7 +80,7 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
     assert Path(result["recording"]).is_file()
 
     status = shell.state()
-    assert status["state"] == "idle" and status["simulated"]
+    assert status["state"] == "idle" and status["source"] == "simulated"
     assert "SIMULATED" in shell.ask("status")[1]
     code, out, _ = shell.ask("doctor", "--json")
     assert code == 0 and json.loads(out)["ok"]

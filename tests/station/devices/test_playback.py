@@ -136,7 +136,7 @@ CONFIG = StationConfig(
 
 async def test_a_cell_plays_the_recorded_poses_and_can_reach_no_hardware(tmp_path: Path) -> None:
     cell = playback_cell(record(tmp_path / "s.mcap", joints=True, config=msgspec.yaml.encode(CONFIG)))
-    assert cell.source == "playback" and not cell.simulated
+    assert cell.source == "playback"
     assert cell.config.robot.host == "" and cell.config.camera.driver == "playback"
     assert cell.config.trigger is None and cell.trigger is None and cell.config.name == "playback"
     assert cell.plan is not None and len(cell.plan.poses) == len(STARTS)

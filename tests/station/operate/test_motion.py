@@ -42,7 +42,7 @@ def idle(**fields: Any) -> StationStatus:
     return StationStatus(state=StationState.IDLE, camera=CAMERA, **fields)
 
 
-@pytest.mark.parametrize("ready", [idle(robot=STANDING), idle(playback=True)])
+@pytest.mark.parametrize("ready", [idle(robot=STANDING), idle(source="playback")])
 def test_a_cell_is_ready_when_its_devices_are_there_and_joints_known_but_for_a_playback(
     ready: StationStatus,
 ) -> None:

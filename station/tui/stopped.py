@@ -58,6 +58,6 @@ def stopped_text(status: StationStatus) -> Content:
         Content.assemble(
             (" 3  ", "bold $strong"),
             (" F8  Acknowledge ", "bold $onaccent on $warn"),
-            ("  Nothing moves. F5 then asks again.", "$dim"),
+            (f"  Nothing moves. {'F3 then goes on' if robot.by_hand else 'F5 then asks again'}.", "$dim"),
         ),
     )

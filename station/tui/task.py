@@ -249,7 +249,9 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     if state is StationState.PAUSED:
         saved = f"{status.session.captured} of {len(status.session.poses)} are saved; F7 finishes with these."
         why = " ".join(words for words in (sentence(status.reason), saved) if words)
-        return Action("F5", "Continue", why, look=bool(status.reason))
+        left = status.robot.by_hand or any(pose.state == "planned" for pose in status.session.poses)
+        key, label = ("F5", "Continue") if left else ("F7", "Finish")
+        return Action(key, label, why, look=bool(status.reason))
     if state is StationState.FREE_DRIVE:
         return Action("F2", "Capture an image here", "Guide the arm by the pendant's button; F3 ends it.")
     return None

@@ -54,6 +54,9 @@ def test_the_card_says_that_the_arm_stands_only_where_it_is_known(cause: str) ->
     assert ("hy it stopped" in rests) is (cause != "protective-stop")
     assert (said(still=False) == rests) is (cause == "stale-state")
     assert (said(still=True, state=None) == rests) is (cause == "stale-state")
+    assert "F5" in stopped_text(status).plain
+    by_hand = stopped_text(with_robot(status, by_hand=True)).plain
+    assert "F3" in by_hand and "F5" not in by_hand, "nobody can let it move from here"
     untold = with_robot(status, condition=ArmCondition())
     assert "✓" in stopped_text(status).plain and "✓" not in stopped_text(untold).plain
 

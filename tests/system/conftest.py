@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import os
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -23,6 +21,7 @@ import pytest
 from calibrate.cli import main as calibrate
 from calibrate.files.versions import installed_versions
 from calibrate.geometry import Array, difference
+from station.cell.child import start_child
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState, StationStatus
@@ -74,43 +73,21 @@ class DaemonProcess:
     def __init__(
         self, controller: SimulatedController, folder: Path, root: Path, number: int, control: str = ""
     ) -> None:
-        self.controller, self.root = controller, root
         self.socket = folder / f"{number}.sock"
         self.notified = Notified(folder) if number == 1 else None
-        truth = folder / "truth.json"
-        environment = dict(os.environ) | ({"CELL_CONTROL": control} if control else {})
+        command = ["env", *([f"CELL_CONTROL={control}"] if control else [])]
         if self.notified is not None:
-            environment |= {"NOTIFY_SOCKET": str(self.notified.path), "WATCHDOG_USEC": "1000000"}
-        self._words = (root / f"daemon-{number}.log").open("wb")
-        self.process = subprocess.Popen(
-            [*PROGRAM, controller.host, str(truth), str(root), str(self.socket)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._words,
-            env=environment,
-            start_new_session=True,
-        )
-
-    async def ready(self) -> None:
-        line = await asyncio.wait_for(asyncio.to_thread(self.process.stdout.readline), PATIENCE_S)
-        assert line, "the daemon ended at once; see its log"
+            command += [f"NOTIFY_SOCKET={self.notified.path}", "WATCHDOG_USEC=1000000"]
+        command += [*PROGRAM, controller.host, str(folder / "truth.json"), str(root), str(self.socket)]
+        self._child = start_child("daemon", command, PATIENCE_S, root / f"daemon-{number}.log")
+        self.process = self._child.process
 
     async def client(self) -> Client:
         return await Client(self.socket).open()
 
     def end(self) -> None:
-        if self.process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                self.process.send_signal(signal.SIGCONT)
-            self.process.stdin.close()
-            try:
-                self.process.wait(PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout, self._words):
-            if pipe is not None:
-                pipe.close()
+        self.process.send_signal(signal.SIGCONT)
+        self._child.stop(PATIENCE_S)
         if self.notified is not None:
             self.notified.close()
 
@@ -127,9 +104,9 @@ class SystemRig:
 
     async def daemon(self) -> DaemonProcess:
         number = len(self.daemons) + 1
-        made = DaemonProcess(self.controller, self.folder, self.root, number, self.control)
+        where = self.controller, self.folder, self.root
+        made = await asyncio.to_thread(DaemonProcess, *where, number, self.control)
         self.daemons.append(made)
-        await made.ready()
         return made
 
     def speed_rad_s(self) -> float:

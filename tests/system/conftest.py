@@ -77,7 +77,7 @@ class DaemonProcess:
         self.notified = Notified(folder) if number == 1 else None
         command = ["env", *([f"CELL_CONTROL={control}"] if control else [])]
         if self.notified is not None:
-            command += [f"NOTIFY_SOCKET={self.notified.path}", "WATCHDOG_USEC=1000000"]
+            command.append(f"NOTIFY_SOCKET={self.notified.path}")
         command += [*PROGRAM, controller.host, str(folder / "truth.json"), str(root), str(self.socket)]
         self._child = start_child("daemon", command, PATIENCE_S, root / f"daemon-{number}.log")
         self.process = self._child.process

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -28,9 +29,9 @@ class WorkerError(StationError):
 class Workers:
     """Runs calls in the worker process, one after the other, in order."""
 
-    def __init__(self, initializer: Callable[[], None], warm_up: Callable[[], object]) -> None:
-        """`initializer` runs first in each new process, then `warm_up`, which imports what is needed."""
-        self._initializer, self._warm_up = initializer, warm_up
+    def __init__(self, initializer: Callable[[], None]) -> None:
+        """`initializer` runs first in each new process; its module imports what is needed."""
+        self._initializer = initializer
         self._pool: ProcessPoolExecutor | None = None
         self._turn = asyncio.Lock()
         self._closed = False
@@ -39,7 +40,7 @@ class Workers:
 
     async def start(self) -> None:
         """Start the worker; return when it has imported what it needs (about a second)."""
-        await self.call(self._warm_up)
+        await self.call(os.getpid)
 
     async def call(
         self, function: Callable[..., R], *args: object, timeout_s: float = 60.0, **named: object
@@ -58,7 +59,7 @@ class Workers:
                     pool = self._pool = ProcessPoolExecutor(
                         1, get_context("spawn"), initializer=self._initializer
                     )
-                    await self._ask(pool, START_S, partial(self._warm_up))
+                    await self._ask(pool, START_S, partial(os.getpid))
                 return await self._ask(pool, timeout_s, partial(function, *args, **named))
         finally:
             self.waiting -= 1

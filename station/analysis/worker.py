@@ -81,11 +81,6 @@ def start_worker() -> None:
     cv2.setNumThreads(1)
 
 
-def warm_up() -> int:
-    """Import everything needed; return the worker's process id."""
-    return os.getpid()
-
-
 def sight(
     image: Pixels,
     board: BoardSpec,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from recordings.errors import RecordingError
 from station.analysis.pool import Workers
-from station.analysis.worker import start_worker, warm_up
+from station.analysis.worker import start_worker
 from station.cell.errors import RefusedError, RobotError, StationError
 from station.cell.layout import approval_sha256
 from station.cell.pose_plan import Plan
@@ -62,7 +62,7 @@ class Session:
         config = cell.config
         self.store = StatusStore(StationStatus(source=cell.source, cell=config.name, mount=config.mount))
         monitor = StillnessMonitor(config.stillness)
-        self.context = SessionContext(cell, self.store, Workers(start_worker, warm_up), monitor, root)
+        self.context = SessionContext(cell, self.store, Workers(start_worker), monitor, root)
         # This clock goes on while the computer sleeps: no offer outlives that.
         self.approvals = ApprovalManager(lambda: time.clock_gettime(time.CLOCK_BOOTTIME))
         self.supervisor = SessionSupervisor(self.context, self.approvals.void)

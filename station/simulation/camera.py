@@ -77,7 +77,7 @@ class RenderedCamera:
 
     async def _open(self) -> None:
         if self._workers is None:
-            self._workers = Workers(partial(start_camera, self._truth, self._host), partial(ask, "warm_up"))
+            self._workers = Workers(partial(start_camera, self._truth, self._host))
         self._lost = False
         self.counter.restart()
         await self._call("clock")  # answered when the process has started

@@ -116,6 +116,7 @@ def start_camera(truth: CellTruth, controller_host: str) -> None:
     live_with_parent()
     cv2.setNumThreads(1)
     _camera = CameraProcess(truth, controller_host)
+    _camera.warm_up()
 
 
 def ask(name: str, *arguments: object) -> Any:

@@ -11,7 +11,7 @@ import pytest
 
 from station.analysis.estimation import running_estimate
 from station.analysis.pool import WorkerError, Workers
-from station.analysis.worker import start_worker, warm_up
+from station.analysis.worker import start_worker
 from station.cell.pose_plan import PlannedPose
 from station.cell.session_folder import SessionState
 from station.cell.status import StationState as S
@@ -184,7 +184,7 @@ async def test_a_defect_in_the_estimate_costs_one_estimate(rig: Rig, monkeypatch
 async def test_a_call_that_hangs_costs_its_own_answer_only_and_nobody_waits_for_its_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    workers = Workers(start_worker, warm_up)
+    workers = Workers(start_worker)
     await workers.start()
     ended, waited = threading.Event(), list[bool]()
     for process in workers._pool._processes.values():  # ones that take their time to end

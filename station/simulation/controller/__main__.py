@@ -104,13 +104,8 @@ async def _serve(host: str, settings: Settings, ends_with_input: bool) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
     machine = Machine(host, settings)
-    try:
-        machine.open()
-        admin = await AdminServer(machine).open()
-    except OSError:
-        for service in machine.services:
-            service.close()
-        raise
+    machine.open()
+    admin = await AdminServer(machine).open()
     ready = {"ready": True, "host": host, "model": settings.model, "pid": os.getpid()}
     print(json.dumps(ready), flush=True)
     if ends_with_input:

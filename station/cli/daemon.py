@@ -38,19 +38,22 @@ def find_config() -> Path | None:
     return next((p for p in (user_config(), Path("/etc/station/station.yaml")) if p.is_file()), None)
 
 
-def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
-    """The socket of a daemon that answers; starts one where none does. StationError when that fails.
+def ensure_daemon(socket: Path) -> Path:
+    """The socket of a daemon that answers; starts one where none does. StationError when that fails."""
+    if not answers(socket):
+        start_daemon(socket, find_config())
+    return socket
 
-    `config`: the cell to serve; None: that of `find_config`.
+
+def start_daemon(socket: Path, config: Path | None) -> None:
+    """Start a daemon that goes on without this program. StationError when it cannot, as where one serves.
+
+    `config`: the cell to serve; None: a simulated one.
     """
-    if answers(socket):
-        return socket
-    config = config or find_config()
     what = ["--simulate"] if config is None else ["--config", str(config)]
     cell = "a SIMULATED cell (none set up: `station new`)" if config is None else f"the cell of {config}"
     print(f"Starting {cell} …", file=sys.stderr)
     _started([*what, "--socket", str(socket)], state_root() / "daemon.log", subprocess.DEVNULL)
-    return socket
 
 
 @contextmanager
@@ -76,20 +79,10 @@ def _started(arguments: Sequence[str], log: Path, stdin: int) -> ChildProcess:
 
 def tell_what_goes_on(socket: Path) -> None:
     """Tell a person who closed the screen that the daemon goes on, and how to end it."""
-    if (how := _way_to_end(socket)) is not None:
-        print(f"The station goes on without this screen. `station` opens it again.{how and f' End it{how}.'}")
-
-
-def require_none(path: Path) -> None:
-    """Raise StationError (`already-served`) where a daemon serves."""
-    if (how := _way_to_end(path)) is not None:
-        raise StationError("already-served", path=path, how=how)
-
-
-def _way_to_end(socket: Path) -> str | None:
-    """Say how this user ends the daemon that serves; empty: it is another's; None: none serves."""
     with connection(AF_UNIX) as link:
-        return way_to_end(link) if link.connect_ex(str(socket)) == 0 else None
+        if link.connect_ex(str(socket)) == 0:
+            end = f" End it{how}." if (how := way_to_end(link)) else ""
+            print(f"The station goes on without this screen. `station` opens it again.{end}")
 
 
 def answers(socket: Path) -> bool:

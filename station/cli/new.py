@@ -10,7 +10,7 @@ import typer
 from recordings.files import state_root
 from station.cell.socket_folder import default_socket
 from station.cli.console import err, require_terminal
-from station.cli.daemon import ensure_daemon, own_daemon, require_none, tell_what_goes_on, user_config
+from station.cli.daemon import own_daemon, start_daemon, tell_what_goes_on, user_config
 from station.devices.guided import RealHardware
 from station.operate.cell_setup import CellSetup
 
@@ -44,8 +44,8 @@ def _serve(config: Path) -> None:
     from station.tui.app import run
 
     socket = default_socket()
-    require_none(socket)
-    run(ensure_daemon(socket, config))
+    start_daemon(socket, config)
+    run(socket)
     tell_what_goes_on(socket)
 
 
@@ -56,7 +56,6 @@ def _rehearse(config: Path, root: Path | None) -> None:
     what = ["--config", str(config), "--rehearse", *([] if root is None else ["--root", str(root)])]
     err.print(f"Starting the rehearsal of {config}: SIMULATED, nothing real moves …")
     log = state_root(root) / "rehearsal" / "daemon.log"
-    log.parent.mkdir(parents=True, exist_ok=True)
     with own_daemon(what, log) as socket:
         run(socket)
     err.print(f"The rehearsal has ended. `station new` opens the wizard again; {config} is as it was.")

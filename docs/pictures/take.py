@@ -23,6 +23,7 @@ from PIL import Image
 from textual.pilot import Pilot
 
 from station.cell.status import StationState
+from station.cli.daemon import own_daemon
 from station.protocol import verbs
 from station.protocol.client import Client
 from station.tui.app import StationApp
@@ -194,22 +195,15 @@ def main() -> None:
         [] if options.wanted else [("120x36", "light")]
     )
     cameras = [Camera(options.output, size, theme) for size, theme in chosen]
-    with tempfile.TemporaryDirectory() as folder:
-        state = Path(folder)
-        socket = state / "control.sock"
-        serve = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
-        daemon = subprocess.Popen(
-            [*serve, "--socket", str(socket), "--root", str(state / "root")],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=(state / "daemon.log").open("wb"),
-        )  # fmt: skip
+    with (
+        tempfile.TemporaryDirectory() as root,
+        own_daemon(["--simulate", "--root", root], Path(root) / "daemon.log") as socket,
+    ):
         try:
-            assert daemon.stdout is not None
-            daemon.stdout.readline()  # it is ready
             asyncio.run(look(cameras, socket))
         finally:
             for camera in cameras:
                 camera.develop()
-            daemon.communicate(timeout=60)
 
 
 if __name__ == "__main__":

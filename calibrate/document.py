@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import platform
 import sys
-from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from calibrate.files.calibration import (
     Views,
     ViewWeight,
 )
+from calibrate.files.validity import time_text
 from calibrate.geometry import Transform
 from calibrate.handeye.solution import Solution
 from calibrate.lens.intrinsics import Intrinsics
@@ -57,7 +57,7 @@ def make_calibration(
     frames, (X, covariance) = solution.parent_from_child, solution.installed
     return Calibration(
         format=FORMAT,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        created=time_text(),
         source=info.source,
         mount=solution.mount,
         result=FramePose.of(Transform(frames.parent, frames.child, X)),

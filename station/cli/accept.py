@@ -7,7 +7,6 @@ at the pendant. A stop that could not be measured is reported as not measured, n
 from __future__ import annotations
 
 import asyncio
-import getpass
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from typing import Annotated
 
 import typer
 
+from calibrate.files.versions import who
 from station.cell.arm_acceptance import (
     STOP_GIVEN,
     Acceptance,
@@ -175,8 +175,7 @@ class AcceptanceTest:
         slowest_m_s = min((result.speed_m_s for result in self.results), default=0.0)
         reached = slowest_m_s >= REACHED * self.speed_m_s
         speed_m_s = (self.speed_m_s if reached else slowest_m_s) if accepted else 0.0
-        who = getpass.getuser()
-        return Acceptance(self.subject, accepted, speed_m_s, time.time_ns(), who, tuple(self.results))
+        return Acceptance(self.subject, accepted, speed_m_s, time.time_ns(), who(), tuple(self.results))
 
     async def _tested(self, way: StopWay) -> bool:
         """Test one way, repeating moves that were not measured; False: failed, or not approved."""

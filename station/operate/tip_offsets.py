@@ -6,9 +6,7 @@ The station moves nothing: the arm is moved in freedrive or jogged on the pendan
 from __future__ import annotations
 
 import asyncio
-import getpass
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,8 @@ from calibrate.check.same_cell import require_same_cell
 from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.folders import VERSION_NAME
 from calibrate.files.touch import Touch
-from calibrate.files.versions import note_in_file, note_installed
+from calibrate.files.validity import time_text
+from calibrate.files.versions import note_in_file, note_installed, who
 from calibrate.geometry import Array, inverse, transform_points
 from calibrate.views import BoardView
 from station.cell.config import Vector3
@@ -92,8 +91,8 @@ def read_touch(board: SeenBoard, corner: int, status: StationStatus | None) -> T
         offset_mm=_mm(offset_m),
         sigma_mm=_mm(np.sqrt(np.diag(covariance))),
         found="read from the arm",
-        who=getpass.getuser(),
-        wall=datetime.now(UTC).isoformat(timespec="seconds"),
+        who=who(),
+        wall=time_text(),
         pointer=board.pointer,
     )
 

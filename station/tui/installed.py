@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from calibrate.files.calibration import Calibration, Override, Verdict, read_cal
 from calibrate.files.folders import calibrations_folder, current_version, validity_of
 from calibrate.files.install import objections_beside
 from calibrate.files.validity import FILE as VALIDITY_FILE
-from calibrate.files.validity import Validity, ValidityState
+from calibrate.files.validity import Validity, ValidityState, parse_time
 from calibrate.files.versions import LogEntry, read_log, same_solve
 from recordings.files import MAIN_CAMERA
 from station.cell.session_folder import CALIBRATION_FILE, SessionSummary, list_sessions
@@ -101,10 +100,8 @@ def _read_at(path: Path, changed_ns: int) -> Calibration:
 
 def local(iso: str) -> str:
     """Convert a file's UTC time to local time; what is no time stays as it is."""
-    try:
-        return datetime.fromisoformat(iso).astimezone().strftime("%Y-%m-%d %H:%M")
-    except ValueError:
-        return iso
+    when = parse_time(iso)
+    return iso if when is None else when.astimezone().strftime("%Y-%m-%d %H:%M")
 
 
 def state_root(calibration: str | Path) -> Path:

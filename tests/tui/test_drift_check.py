@@ -11,7 +11,6 @@ import pytest
 from calibrate.check.history import CheckEntry, Trend, append_check
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
-from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
 from station.protocol import verbs
 from station.tui import jobs
@@ -21,8 +20,6 @@ from station.tui.result import check_rows
 from tests.tui.conftest import FakeLink, idle, in_session, opened, said, text_of, until
 from tests.tui.test_install import GOOD
 
-CHECK_PLAN = "cd" * 32
-LOADED = Plan("UR10", "eye-in-hand", (PlannedPose("p1", (0.0,) * 6),) * 3)
 JOB = """
 import json, pathlib, sys
 (pathlib.Path(__file__).parent / "asked").write_text(json.dumps(sys.argv[1:]))
@@ -36,8 +33,6 @@ def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     write_calibration(GOOD, tmp_path / "c.yaml")
     link.root = tmp_path / "root"
     install(tmp_path / "c.yaml", root=link.root, cell="simulated")
-    link.answers["make_plan"] = verbs.Done()
-    link.answers["plan"] = verbs.LoadedPlan(LOADED)
     (tmp_path / "some_job.py").write_text(JOB)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(

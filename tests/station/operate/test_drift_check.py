@@ -17,7 +17,6 @@ from tests.station.operate.test_motion import Telling
 from tests.tui.conftest import FakeLink
 
 PREVIEW = MotionPreview("t", "drift check", "cd" * 32, 8, 1.0, 0.5, 0.2, 30.0, "")
-LOADED = Plan("UR10", "eye-in-hand", (PlannedPose("p1", (0.0,) * 6),) * 3)
 
 
 def loaded(*attempts: int) -> StationStatus:
@@ -27,10 +26,10 @@ def loaded(*attempts: int) -> StationStatus:
 
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> FakeLink:
-    """Of a cell with something installed and a plan."""
+    """Of a cell with something installed."""
     monkeypatch.setattr(drift_check, "installed_calibration", lambda root, camera: None)
     link = FakeLink()
-    link.answers |= {"plan": verbs.LoadedPlan(LOADED), "prepare": PREVIEW}
+    link.answers["prepare"] = PREVIEW
     return link
 
 
@@ -61,7 +60,7 @@ async def test_it_is_loaded_again_where_nothing_was_started(
 
 
 async def test_a_plan_whose_hash_was_approved_before_is_captured_as_it_is(link: FakeLink) -> None:
-    plan = msgspec.structs.replace(LOADED, note="for the night")
+    plan = Plan("UR10", "eye-in-hand", (PlannedPose("p1", (0.0,) * 6),))
     assert await start_drift_check(link, loaded(), AsyncMock(return_value=True), plan=plan)
     assert verbs.LoadPlan(plan) in link.asked and "make_plan" not in link.verbs
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from calibrate.boards.model import board_points
 from calibrate.check.board_now import locate_board, offset_covariance
 from calibrate.files.calibration import write_calibration
+from calibrate.files.versions import note_in_file
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import CameraIdentity, RobotIdentity
@@ -77,8 +79,10 @@ class Daemon:
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 async def test_the_tip_on_the_true_corner_tells_the_offset_the_other_way_round(
-    mount: str, tmp_path: Path
+    mount: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """And whoever holds it: a name that is no UTF-8 goes into the file, too."""
+    monkeypatch.setenv("LOGNAME", os.fsdecode(b"anna\xff"))
     daemon = Daemon(mount)
     board = await daemon.seen(tmp_path)
     corner = board_points(daemon.truth.board)[CORNER]
@@ -87,6 +91,7 @@ async def test_the_tip_on_the_true_corner_tells_the_offset_the_other_way_round(
     assert touch.corner_mm == pytest.approx(1000 * corner[:2])
     assert (touch.corner, touch.found) == (CORNER, "read from the arm")
     assert 0.01 < min(touch.sigma_mm) <= max(touch.sigma_mm) < 1
+    assert note_in_file(tmp_path / "c.yaml", [touch]).verification == [touch]
 
 
 @pytest.mark.parametrize(("configured", "tip"), [(True, TIP), (False, (0.0, 0.0, 0.2))])

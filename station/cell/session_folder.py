@@ -52,6 +52,8 @@ class SessionSummary(msgspec.Struct, frozen=True):
     recording: str
     """File of the recording, or folder of several; empty: nothing was recorded."""
     views: int
+    check: bool
+    """True: a drift check of the installed calibration."""
     sealed: bool
     calibration: str
     """Path of the calibration file made from it; empty: none."""
@@ -147,6 +149,7 @@ def _described(folder: Path) -> SessionSummary:
         folder=str(folder),
         recording=str(files[0] if len(files) == 1 else folder) if files else "",
         views=sum(pose.counts for pose in state.poses) if state else 0,
+        check=state is not None and state.check,
         sealed=bool(files) and not any(file.name.endswith(PART_SUFFIX) for file in files),
         calibration=str(calibration) if calibration.is_file() else "",
     )

@@ -97,6 +97,8 @@ def _row(kept: Kept) -> tuple[Content, ...]:
     elif check is not None:
         verdict = mark("done" if check.passed else "failed", "PASS" if check.passed else "FAIL")
         became = "drift check"
+    elif session.check:
+        verdict, became = mark("todo", "k judges it"), "drift check"
     if not session.sealed:
         verdict, became = mark("look", "UNFINISHED"), "c recovers it"
     now = became.startswith("INSTALLED")

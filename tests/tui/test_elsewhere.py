@@ -13,8 +13,11 @@ from calibrate.files.calibration import Calibration, read_calibration, write_cal
 from calibrate.files.folders import calibrations_folder
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
+from station.cell.pose_plan import Plan
+from station.cell.session_folder import SessionState, write_state
 from station.tui import app as app_module
 from station.tui.installed import read_installed
+from station.tui.sessions import _row
 from station.tui.task import next_action
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, text_of, until
 from tests.tui.test_install import GOOD, OFF
@@ -121,10 +124,12 @@ async def test_after_a_drift_check_the_result_is_what_it_judged(link: FakeLink, 
     put(root, "s-1")
     app, folder = app_on(link), root / "sessions" / "s-2"
     (folder / "calibration.yaml").unlink()
+    write_state(folder, SessionState("simulated", Plan("UR10", "eye-in-hand", ()), (), check=True))
     link.show(in_session(idle(), name="s-2", check=True, folder=str(folder), recording="session.mcap"))
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.known.result and app.known.sessions)
         assert next_action(app.known).key == "k"
+        assert _row(app.known.sessions[0])[1].plain == "drift check"
         append_check(CheckEntry(0.0, 1, "s-2", True, (0.0,) * 6, 1.0, 12.6), root)
         await until(pilot, lambda: next_action(app.known).key == "d")
 

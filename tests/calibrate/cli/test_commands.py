@@ -254,14 +254,13 @@ def test_names_are_printed_as_they_are(real_file: Path, tmp_path: Path) -> None:
 
 
 def test_bytes_that_are_no_utf_8_are_one_line(
-    real_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    real_file: Path, make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("LOGNAME", os.fsdecode(b"anna\xff"))
     assert run("install", real_file, cwd=tmp_path).returncode == 0
-    for command in (["withdraw"], ["rollback", "1", "--reason"], ["install", "c.yaml", "--override"]):
-        failed = msgspec.structs.replace(read_calibration(real_file), override=None, verification=[])
-        missed = Touch(0, (0.0, 0.0), (5.0, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01")
-        write_calibration(msgspec.structs.replace(failed, verification=[missed]), tmp_path / "c.yaml")
+    missed = Touch(0, (0.0, 0.0), (5.0, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01")
+    failed = make_file(verification=[missed])
+    for command in (["withdraw"], ["rollback", "1", "--reason"], ["install", failed, "--override"]):
         refused(run(*command, os.fsdecode(b"knocked over \xff"), cwd=tmp_path), 1, "not-utf-8")
     listed = json.loads(run("list", "--json", cwd=tmp_path).stdout)
     assert [row["validity"]["state"] for row in listed] == ["valid"]

@@ -39,15 +39,11 @@ def ended() -> Iterator[list[subprocess.Popen[str]]]:
             pipe.close()
 
 
-def started(ended: list[subprocess.Popen[str]], *words: object, **more: Any) -> subprocess.Popen[str]:
-    process = subprocess.Popen([*map(str, words)], stdout=subprocess.PIPE, text=True, **more)
+def follow(ended: list[subprocess.Popen[str]], root: Path) -> subprocess.Popen[str]:
+    command = (sys.executable, "-m", "calibrate.cli", "follow", "--root", str(root), "--poll-s", "0.02")
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     ended.append(process)
     return process
-
-
-def follow(ended: list[subprocess.Popen[str]], root: Path) -> subprocess.Popen[str]:
-    command = (sys.executable, "-m", "calibrate.cli", "follow", "--root", root, "--poll-s", "0.02")
-    return started(ended, *command)
 
 
 def test_every_change_is_one_line(

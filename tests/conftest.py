@@ -149,7 +149,7 @@ def controller() -> Iterator[Callable[..., SimulatedController]]:
     yield start
     try:
         for child in running:
-            if child.running:  # a test that ends one itself has looked before
+            if child.process.poll() is None:  # a test that ends one itself has looked before
                 check_allow_list(child.host)
     finally:
         for child in running:

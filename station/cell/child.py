@@ -24,10 +24,6 @@ class ChildProcess:
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
 
-    @property
-    def running(self) -> bool:
-        return self.process.poll() is None
-
     def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> None:
         """End the child, by force if it does not react. Idempotent."""
         for pipe in (self.process.stdin, self.process.stdout):

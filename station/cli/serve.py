@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing import util
 from pathlib import Path
@@ -107,8 +108,7 @@ async def serve_cell(
     try:
         daemon = Daemon(cell, root, socket, _end_in_time, real_time)
         if end_with_stdin:
-            loop = asyncio.get_running_loop()
-            loop.add_reader(sys.stdin.fileno(), lambda: None if os.read(0, 4096) else daemon.end())
+            at_end_of_input(daemon.end)
         await daemon.run(lambda: print(json.dumps({"ready": True, "socket": str(socket)}), flush=True))
     finally:
         cell.ended()
@@ -116,6 +116,18 @@ async def serve_cell(
     sys.stdout.flush()
     util._run_finalizers(0)  # type: ignore[attr-defined]  # else the worker's semaphores count as leaked
     os._exit(0)
+
+
+def at_end_of_input(ended: Callable[[], None]) -> None:
+    """Call back when standard input ends, as it does when the program that started this one dies."""
+    loop = asyncio.get_running_loop()
+
+    def read() -> None:
+        if not os.read(0, 4096):
+            loop.remove_reader(0)  # its end would be told in every round
+            ended()
+
+    loop.add_reader(0, read)
 
 
 def _end_in_time() -> None:

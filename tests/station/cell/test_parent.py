@@ -45,6 +45,20 @@ def test_a_stopped_child_dies_with_its_killed_parent() -> None:
                 os.kill(child, signal.SIGKILL)
 
 
+def test_a_daemon_hears_once_that_its_input_ended() -> None:
+    """While it closes its devices it would do little else."""
+    code = (
+        "import asyncio\n"
+        "from station.cli.serve import at_end_of_input\n"
+        "async def main():\n"
+        "    at_end_of_input(lambda: print('ended', flush=True))\n"
+        "    await asyncio.sleep(0.2)\n"
+        "asyncio.run(main())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], input=b"words", capture_output=True, check=True)
+    assert done.stdout == b"ended\n"
+
+
 def test_a_child_whose_parent_is_gone_already_does_nothing() -> None:
     done = subprocess.run([sys.executable, "-c", CHILD, "1"], capture_output=True)
     assert (done.returncode, done.stdout) == (1, b"")

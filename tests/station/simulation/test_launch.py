@@ -22,8 +22,8 @@ def test_it_is_ready_when_the_call_returns_and_gone_after_the_block() -> None:
     with start_controller("UR5e") as running:
         with running.admin() as admin:
             assert admin.ask("state")["model"] == "UR5e"
-        assert running.running and running.host.startswith("127.")
-    assert not running.running and running.process.returncode == 0
+        assert running.process.poll() is None and running.host.startswith("127.")
+    assert running.process.returncode == 0
     running.stop()
 
 

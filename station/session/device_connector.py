@@ -81,4 +81,3 @@ class DeviceConnector:
                 await cell.trigger.close()
 
         await asyncio.gather(close_robot(), close_camera())
-        await asyncio.to_thread(cell.ended)

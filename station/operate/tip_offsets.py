@@ -48,16 +48,18 @@ class SeenBoard:
     """How `tip_m` is known."""
 
 
-async def see_board(link: Client, file: Path) -> SeenBoard:
+async def see_board(link: Client, status: StationStatus, file: Path) -> SeenBoard:
     """Take an image; find the board by the calibration in `file`. Raises StationError, CalibrationError."""
     calibration = read_calibration(file)
     seen = await link.call(Observe(calibration.board), timeout_s=LOOK_S)
-    serials = seen.robot_serial, seen.camera_serial
-    require_same_cell("The station", calibration, seen.mount, seen.source, *serials)
+    robot, camera = status.robot.identity, status.camera.identity
+    if robot is None or camera is None:
+        raise RefusedError("no-robot-state")
+    require_same_cell("The station", calibration, status.mount, status.source, robot.serial, camera.serial)
     if not seen.corners:
         advice = "Jog the arm or lay the board so that the camera sees it whole."
         raise RefusedError("no-board", reason="No board in the image.", advice=advice)
-    tip_m, pointer = seen.tcp_offset[:3], "the pendant's tool"
+    tip_m, pointer = robot.tcp_offset[:3], "the pendant's tool"
     if link.config is not None and link.config.pointer is not None:
         tip_m, pointer = link.config.pointer.tip_m, "the configured pointer"
     elif np.linalg.norm(tip_m) < _SHORTEST_M:

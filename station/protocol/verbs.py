@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 import msgspec
 
-from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector6
+from recordings.schema.messages import BoardSpec, Matrix4
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
@@ -118,13 +118,7 @@ class PreviewImage(msgspec.Struct, frozen=True, omit_defaults=True):
 class Observation(msgspec.Struct, frozen=True, omit_defaults=True):
     """Detection of a tag in an image, and the arm's pose at mid-exposure."""
 
-    mount: Mount
-    source: Source
-    robot_serial: str
-    camera_serial: str
     base_from_flange: Matrix4
-    tcp_offset: Vector6 = (0.0,) * 6
-    """The pendant's tool centre point, in the flange."""
     corners: tuple[int, ...] = ()
     """Rows of `calibrate.boards.model.board_points` that were found."""
     pixels: tuple[tuple[float, float], ...] = ()

@@ -80,12 +80,7 @@ class Previewer:
                 detect, viewable(image.pixels, image.pixel_format), tag, False, False, timeout_s=_OBSERVE_S
             )
         return Observation(
-            mount=context.cell.config.mount,
-            source=context.cell.source,
-            robot_serial=arm.identity.serial,
-            camera_serial=context.cell.camera.identity.serial,
             base_from_flange=matrix4(flange_pose(state, arm.identity.tcp_offset)),
-            tcp_offset=arm.identity.tcp_offset,
             corners=tuple(found.indices.tolist()),
             pixels=tuple((float(u), float(v)) for u, v in found.pixels),
         )

@@ -72,7 +72,7 @@ class TouchCorners(Question[list[Touch]]):
 async def run_touch_test(link: DaemonLink, result: Result, _: Calibration) -> None:
     """Read corners until the person ends it, then write what was found into the file."""
     path = Path(result.path)
-    board = await link.attempt(see_board(link.client, path))
+    board = await link.attempt(see_board(link.client, link.known.shown, path))
     if board is None or not (touches := await link.ask_person(TouchCorners(board))):
         return
     words = await link.attempt(asyncio.to_thread(note_touches, state_root(path), path, touches))

@@ -18,7 +18,7 @@ from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rota
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig, matrix4
-from station.cell.status import RobotStatus, StationStatus
+from station.cell.status import CameraStatus, RobotStatus, StationStatus
 from station.operate.tip_offsets import SeenBoard, read_touch, see_board
 from station.protocol.verbs import Observation, Observe
 from station.simulation.cells import cell_config, make_cell
@@ -27,7 +27,7 @@ from tests.recordings.small_recording import make_state
 from tests.station.calibrated_cell import POINTER, ROBOT_M, ROBOT_RAD, calibration_of, seen_from
 
 ROBOT, CAMERA = RobotIdentity(model="UR10", serial="1"), CameraIdentity(serial="2")
-TIP = (0.01, -0.02, 0.15)
+TIP, PENDANT = (0.01, -0.02, 0.15), (0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
 CORNER = 7
 
 
@@ -46,16 +46,12 @@ class Daemon:
             flange = flange @ pose(np.eye(3), [0.0, 0.2, -0.3])
         view = seen_from(self.truth, flange, self.board)
         self.observation = Observation(
-            mount=self.truth.mount,
-            source="simulated",
-            robot_serial="1",
-            camera_serial="2",
             base_from_flange=matrix4(flange),
-            tcp_offset=(0.0, 0.0, 0.2, 0.0, 0.0, 0.0),
             corners=tuple(range(len(view.pixels))),
             pixels=tuple((float(u), float(v)) for u, v in view.pixels),
         )
         self.observation = msgspec.structs.replace(self.observation, **changes)
+        self.robot, self.photographer = msgspec.structs.replace(ROBOT, tcp_offset=PENDANT), CAMERA
         self.config = msgspec.structs.replace(
             cell_config(self.truth), pointer=PointerConfig(TIP), board=self.truth.board
         )
@@ -66,7 +62,9 @@ class Daemon:
 
     async def seen(self, folder: Path) -> SeenBoard:
         write_calibration(self.calibration, folder / "c.yaml")
-        return await see_board(self, folder / "c.yaml")
+        robot, camera = RobotStatus(self.robot), CameraStatus(self.photographer)
+        status = StationStatus(source="simulated", mount=self.truth.mount, robot=robot, camera=camera)
+        return await see_board(self, status, folder / "c.yaml")
 
     def touching(self, place_m: Array, tip_m: tuple[float, ...] = TIP, still: bool = True) -> StationStatus:
         """The arm with the tip there in `board`, however the flange is turned."""
@@ -94,7 +92,7 @@ async def test_the_tip_on_the_true_corner_tells_the_offset_the_other_way_round(
     assert note_in_file(tmp_path / "c.yaml", [touch]).verification == [touch]
 
 
-@pytest.mark.parametrize(("configured", "tip"), [(True, TIP), (False, (0.0, 0.0, 0.2))])
+@pytest.mark.parametrize(("configured", "tip"), [(True, TIP), (False, PENDANT[:3])])
 async def test_the_pointer_is_the_configured_one_else_the_pendants(
     configured: bool, tip: tuple[float, ...], tmp_path: Path
 ) -> None:
@@ -134,12 +132,16 @@ async def test_what_is_not_known_and_another_cell_are_refused(tmp_path: Path) ->
             read_touch(board, CORNER, status)
     with raises("arm-moves"):
         read_touch(board, CORNER, daemon.touching(board_points(daemon.truth.board)[CORNER], still=False))
-    bare = Daemon(tcp_offset=(0.0,) * 6)
-    bare.config = msgspec.structs.replace(bare.config, pointer=None)
+    bare, blind, elsewhere = Daemon(), Daemon(corners=(), pixels=()), Daemon()
+    bare.robot, bare.config = ROBOT, msgspec.structs.replace(bare.config, pointer=None)
+    elsewhere.photographer = CameraIdentity(serial="3")
+    unknown = Daemon()
+    unknown.robot = None
     for other, code in (
         (bare, "no-pointer"),
-        (Daemon(corners=(), pixels=()), "no-board"),
-        (Daemon(camera_serial="3"), "views-of-another-cell"),
+        (blind, "no-board"),
+        (elsewhere, "views-of-another-cell"),
+        (unknown, "no-robot-state"),
     ):
         with raises(code):
             await other.seen(tmp_path)

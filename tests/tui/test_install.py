@@ -22,7 +22,7 @@ from calibrate.files.versions import installed_versions, note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import StationState
 from station.tui.dialogs import Confirm, Reason
-from station.tui.installed import Installed, Result, read_installed
+from station.tui.installed import Installed, Result, local, read_installed
 from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
@@ -209,6 +209,11 @@ def test_what_is_installed_and_its_validity_are_of_one_version(
     monkeypatch.setattr("station.tui.installed.read_calibration", meanwhile)
     found = read_installed(root)
     assert found.now == GOOD and found.validity is not None and found.validity.version == 1
+
+
+@pytest.mark.parametrize("created", ["0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", "noon"])
+def test_a_time_that_is_none_stays_as_it_is(created: str) -> None:
+    assert local(created) == created
 
 
 def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() -> None:

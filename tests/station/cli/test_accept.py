@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -98,7 +99,10 @@ def begun(ungiven: int = 0, ways: tuple[StopWay, ...] = tuple(StopWay)) -> tuple
     return daemon, Hands(daemon, Nothing(), 0.1, ways)
 
 
-async def test_every_way_has_its_own_approval_and_it_is_accepted_up_to_the_chosen_speed() -> None:
+async def test_every_way_has_its_own_approval_and_it_is_accepted_up_to_the_chosen_speed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("getpass.getuser", Mock(side_effect=KeyError))  # a container's user without a name
     daemon, test = begun()
     found = await test.run()
     assert found.accepted and found.speed_m_s == 0.1

@@ -143,12 +143,6 @@ def test_other_options_or_a_changed_recording_are_solved_again(
     assert before != batch_key(folder, JobOptions())
 
 
-def test_recordings_that_are_not_there_are_told_apart(tmp_path: Path) -> None:
-    missing = [tmp_path / name for name in ("monday.mcap", "tuesday.mcap")]
-    results = run_batch(missing, tmp_path / "out", workers=in_this_process)
-    assert [result.recording for result in results] == [str(path) for path in missing]
-
-
 def test_a_name_may_be_long_and_of_any_bytes(recordings: list[Path], tmp_path: Path) -> None:
     names = "é" * 120 + ".mcap", os.fsdecode(b"b\xff.mcap")
     named = [path.rename(tmp_path / name) for path, name in zip(recordings[1:], names, strict=True)]

@@ -283,10 +283,11 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(small_session_file: Path
     recordings = [shutil.copy(small_session_file, tmp_path / f"r{k}.mcap") for k in range(2)]
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(small_session_file.read_bytes()[:-5000])
-    done = run("batch", *recordings, cut, "-o", "out", "--json", cwd=tmp_path)
+    done = run("batch", *recordings, cut, "gone", "lost", "-o", "out", "--json", cwd=tmp_path)
     assert done.returncode == 3, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [row["solved"] for row in rows] == [True, True, False]
+    assert [row["solved"] for row in rows] == [True, True, False, False, False]
+    assert [Path(row["recording"]).name for row in rows[2:]] == ["cut.mcap", "gone", "lost"]
     assert rows[0]["result"] == rows[1]["result"] and rows[0]["sigma"]
     before = (tmp_path / "out/results.jsonl").read_text().splitlines()
     again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from calibrate.files.calibration import write_calibration
+from calibrate.files.install import install
 from calibrate.job import SolvedRecording, solve_recording
 from tests.calibrate.sessions import Scene, shifted, write_session
 
@@ -73,3 +74,10 @@ def make_file(solved_real: SolvedRecording, tmp_path: Path):
         return path
 
     return make
+
+
+@pytest.fixture
+def root(make_file, tmp_path: Path) -> Path:
+    """A state folder with one installed."""
+    install(make_file(), tmp_path / "s")
+    return tmp_path / "s"

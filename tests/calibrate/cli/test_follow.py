@@ -18,12 +18,6 @@ from tests.patience import PATIENCE_S
 MakeFile = Callable[..., Path]
 
 
-@pytest.fixture
-def root(tmp_path: Path, make_file: MakeFile) -> Path:
-    install(make_file(), tmp_path / "cell")
-    return tmp_path / "cell"
-
-
 def lines(process: subprocess.Popen[str]) -> Iterator[Any]:
     return (json.loads(line) for line in process.stdout)
 
@@ -35,8 +29,7 @@ def ended() -> Iterator[list[subprocess.Popen[str]]]:
     for process in started:
         process.kill()
         process.wait()
-        for pipe in filter(None, (process.stdout, process.stderr)):
-            pipe.close()
+        process.stdout.close()
 
 
 def follow(ended: list[subprocess.Popen[str]], root: Path) -> subprocess.Popen[str]:

@@ -32,12 +32,6 @@ MOVED = ValidityReason("drift-check", "Camera shift 3.00 mm.", {"shift_mm": 3.0}
 KNOCKED = ValidityReason("withdrawn", "A pallet hit the camera.")
 
 
-@pytest.fixture
-def root(make_file: MakeFile, tmp_path: Path) -> Path:
-    install(make_file(), tmp_path / "s")
-    return tmp_path / "s"
-
-
 def check(root: Path, passed: bool, proves: bool = True, reason: ValidityReason = MOVED) -> Validity:
     return note_check(root, reason, passed, proves, datetime.now(UTC) + timedelta(seconds=2))
 

@@ -19,7 +19,6 @@ from recordings.schema.messages import (
     Vector6,
 )
 from station.cell.arm_acceptance import StopTestMove
-from station.cell.clock_fit import ClockFit
 from station.cell.config import vector6
 
 
@@ -130,8 +129,6 @@ class FrameTiming(msgspec.Struct, frozen=True):
     source: TimeSource
     bound_s: float
     """95 % bound of the time of the newest frame, or of a frame taken now"""
-    clock: ClockFit | None = None
-    """The camera's clock against the host's; None where it cannot be read"""
     impossible: int = 0
     """Frames with a stamp before their trigger or after their arrival, so not the start of exposure"""
 

@@ -170,10 +170,10 @@ class FrameClock:
         """Accuracy of frame times now; None before the camera was opened."""
         fit = self.readings.fit
         if self._newest is not None:
-            return FrameTiming(self._newest.source, self._newest.bound_s, fit, self._impossible)
+            return FrameTiming(self._newest.source, self._newest.bound_s, self._impossible)
         if fit is None:
             return FrameTiming("arrival", UNKNOWN_READOUT_S / 2) if self._opened else None
-        return FrameTiming("latched", fit.bound_s, fit)
+        return FrameTiming("latched", fit.bound_s)
 
     def timed(self, image: Image, asked_ns: int, pulse: TriggerPulse | None = None) -> Image:
         """Return the image with its time.

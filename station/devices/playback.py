@@ -55,7 +55,7 @@ class PlaybackCamera:
         self._taken = 0
         self._playing = False
         self.identity = CameraIdentity(recorded.vendor, recorded.model, recorded.serial, "playback")
-        self.timing = FrameTiming("latched", _STAMP_BOUND_S, _HOST_CLOCK)
+        self.timing = FrameTiming("latched", _STAMP_BOUND_S)
 
     def counts(self) -> CameraCounts:
         return CameraCounts(frames=self._taken)

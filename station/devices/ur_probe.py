@@ -30,22 +30,20 @@ class Found:
 
     model: str = ""
     serial: str = ""
-    version: tuple[int, ...] = ()
     remote: bool | None = None
 
 
 async def identify(dashboard: Dashboard) -> Found:
-    """Ask an open dashboard connection for model, serial, version and mode. Raises DashboardError."""
-    version = _version(await dashboard.ask("PolyscopeVersion"))
+    """Ask an open dashboard connection for model, serial and mode. Raises DashboardError."""
+    version = re.search(r"(\d+)\.\d+\.\d+", await dashboard.ask("PolyscopeVersion"))
     model = (await dashboard.ask("get robot model")).strip()
     serial = (await dashboard.ask("get serial number")).strip()
-    e_series = bool(version) and version[0] >= 5
-    if re.fullmatch(r"UR\d+", model) and e_series and model in ("UR3", "UR5", "UR10", "UR16"):
+    e_series = version is not None and int(version[1]) >= 5
+    if e_series and model in ("UR3", "UR5", "UR10", "UR16"):
         model += "e"  # the e-Series dashboard leaves the letter out
     return Found(
         model=model if re.fullmatch(r"UR\d+e?", model) else "",
         serial=serial if serial.isdigit() else "",  # CB3 before 3.12 does not know the question
-        version=version,
         remote=await dashboard.remote(),
     )
 
@@ -97,11 +95,6 @@ async def check_script_port(host: str) -> None:
         raise RobotError("port-closed", where=where, reason=f"no answer within {CONNECT_S:g} s") from None
     except OSError as error:
         raise RobotError("port-closed", where=where, reason=connect_trouble(error, _SERVICE)) from None
-
-
-def _version(text: str) -> tuple[int, ...]:
-    found = re.search(r"(\d+)\.(\d+)\.(\d+)(?:\.(\d+))?", text)
-    return tuple(int(part) for part in found.groups() if part) if found else ()
 
 
 class RobotLock:

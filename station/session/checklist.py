@@ -199,7 +199,7 @@ def _clock_check(context: SessionContext) -> Check:
         remedy = "the camera does not stamp the start of exposure: check its timestamp settings"
         return Check("clocks", "warning", text, remedy)
     if bound_s > limit_s:
-        if frames.clock is None:
+        if frames.source != "latched":
             remedy = (
                 "this camera's clock cannot be read, so poses would be refused: use a hardware trigger, or "
                 f"raise capture.time_bound_s above {bound_s:.3f} (harmless while the arm stands)"

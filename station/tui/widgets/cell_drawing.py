@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import product
 
-import msgspec
 import numpy as np
 from textual.content import Content
 
@@ -29,9 +28,9 @@ _SHORT_M = 0.07
 
 
 @lru_cache(maxsize=4)
-def _scene(encoded: bytes) -> CellLayout | None:
+def _scene(config: StationConfig) -> CellLayout | None:
     try:
-        return layout_of(msgspec.json.decode(encoded, type=StationConfig))
+        return layout_of(config)
     except StationError:
         return None
 
@@ -41,7 +40,7 @@ def cell_scene(config: StationConfig | None, status: StationStatus) -> CellLayou
 
     None without initial poses, and on a console, whose font has no braille.
     """
-    if few_signs() or config is None or (scene := _scene(msgspec.json.encode(config))) is None:
+    if few_signs() or config is None or (scene := _scene(config)) is None:
         return None
     estimate = status.estimate
     if estimate.camera_pose is None or estimate.board_pose is None:

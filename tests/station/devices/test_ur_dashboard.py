@@ -62,11 +62,8 @@ async def test_answers_keep_their_order_without_waiting(serve: Serve) -> None:
 @pytest.mark.parametrize(
     ("answers", "found"),
     [
-        (E_SERIES, Found("UR10e", "20195500001", (5, 11, 1, 108318), False)),
-        (
-            {"PolyscopeVersion": "3.5.3.10825", "get robot model": "UR10"},
-            Found("UR10", "", (3, 5, 3, 10825)),
-        ),
+        (E_SERIES, Found("UR10e", "20195500001", False)),
+        ({"PolyscopeVersion": "3.5.3.10825", "get robot model": "UR10"}, Found("UR10")),
     ],
     ids=["e-Series, which leaves its letter out", "an old controller that knows few questions"],
 )

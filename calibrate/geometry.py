@@ -129,16 +129,12 @@ def rotation_log(R: ArrayLike) -> Array:
     At exactly π the axis sign is ambiguous; either one is returned. What is not quite orthogonal is projected
     first; ValueError for what mirrors. (Written out: SciPy's takes two to three times as long.)
     """
-    M = np.asarray(R, dtype=float)
-    four_qq = _four_qq(M)
-    q = _largest_row(four_qq)
-    if (np.abs(4 * q[..., :, None] * q[..., None, :] - four_qq) > 1e-12).any():  # some are no rotation
-        if (np.linalg.det(M) <= 0).any():
-            raise ValueError("a matrix of this stack is no rotation: its determinant is not positive")
-        q = _largest_row(_four_qq(project_to_rotation(M)))
+    return _rotation_vector(quaternion_from_matrix(R))
+
+
+def _rotation_vector(q: Array) -> Array:
     sine = np.sqrt((q[..., :3] ** 2).sum(axis=-1, keepdims=True))
-    angle = 2 * np.arctan2(sine, np.abs(q[..., 3:]))
-    return np.asarray(q[..., :3] * np.copysign(angle / np.maximum(sine, 1e-300), q[..., 3:]))
+    return np.asarray(q[..., :3] * (2 * np.arctan2(sine, q[..., 3:]) / np.maximum(sine, 1e-300)))
 
 
 def _four_qq(M: Array) -> Array:
@@ -185,20 +181,23 @@ def project_to_rotation(M: Array) -> Array:
 
 
 def quaternion_from_matrix(R: ArrayLike) -> Array:
-    """Convert (..., 3, 3) to quaternions (..., 4) x, y, z, w with w >= 0."""
-    from scipy.spatial.transform import Rotation  # half of a second that programs with a camera need not wait
+    """Convert (..., 3, 3) to quaternions (..., 4) x, y, z, w with w >= 0.
 
+    What is not quite orthogonal is projected first; ValueError for what mirrors.
+    """
     M = np.asarray(R, dtype=float)
-    q = Rotation.from_matrix(M.reshape(-1, 3, 3)).as_quat(canonical=True)
-    return np.asarray(q.reshape(*M.shape[:-2], 4))
+    four_qq = _four_qq(M)
+    q = _largest_row(four_qq)
+    if (np.abs(4 * q[..., :, None] * q[..., None, :] - four_qq) > 1e-12).any():  # some are no rotation
+        if (np.linalg.det(M) <= 0).any():
+            raise ValueError("a matrix of this stack is no rotation: its determinant is not positive")
+        q = _largest_row(_four_qq(project_to_rotation(M)))
+    return np.asarray(q * np.copysign(1.0, q[..., 3:]))
 
 
 def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Array:
     """Convert quaternions (..., 4) x, y, z, w (any positive norm) to (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    q = np.asarray(quaternion_xyzw, dtype=float)
-    return np.asarray(Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3))
+    return rotation_exp(_rotation_vector(np.asarray(quaternion_xyzw, dtype=float)))
 
 
 def pose_from_quaternion(translation_m: ArrayLike, quaternion_xyzw: ArrayLike) -> Array:

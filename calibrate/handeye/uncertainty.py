@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import linalg
-from scipy.linalg import lapack
 
 from calibrate.geometry import Array
 
@@ -20,6 +18,8 @@ def inverse_of(N: Array) -> Array:
     A direction that is undetermined up to rounding (two terms of a rational lens, say) gets a huge variance,
     not an infinite one.
     """
+    from scipy.linalg import eigh, lapack  # a fifth of the start of a daemon, whose worker alone inverts
+
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     scaled = (N + N.T) / 2 * np.outer(scale, scale)
     factor, failed = lapack.dpotrf(scaled)
@@ -28,7 +28,7 @@ def inverse_of(N: Array) -> Array:
         np.fill_diagonal(half, half.diagonal() / 2)
         return np.asarray((half + half.T) * np.outer(scale, scale))
     # Not divide and conquer: it fails for about one matrix in a thousand.
-    values, vectors = linalg.eigh(scaled, driver="ev", check_finite=False)
+    values, vectors = eigh(scaled, driver="ev", check_finite=False)
     if not values[0] > -_ROUNDING:
         raise np.linalg.LinAlgError("some unknowns are left open")
     root = vectors * scale[:, None]

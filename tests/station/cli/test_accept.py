@@ -17,6 +17,7 @@ from station.cell.status import Event, MotionPreview, StationState, StationStatu
 from station.cli import accept
 from station.cli.accept import TRIES, AcceptanceTest
 from station.protocol.verbs import Go, StopTest, Verb
+from tests.codes import raises
 
 SUBJECT = ArmSubject("real", "UR10e", "1", "5.11", (), "ur_rtde")
 
@@ -107,6 +108,9 @@ async def test_every_way_has_its_own_approval_and_it_is_accepted_up_to_the_chose
     found = await test.run()
     assert found.accepted and found.speed_m_s == 0.1
     assert [(verb.way, verb.speed_m_s) for verb in daemon.asked] == [(way, 0.1) for way in StopWay]
+    test.subject = ArmSubject("real", "UR10e", "2", "5.11", (), "ur_rtde")
+    with raises("subject-changed"):
+        await test.run()
     assert len({preview.token for preview in test.approved}) == daemon.went == len(StopWay)
 
 

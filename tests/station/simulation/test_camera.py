@@ -80,11 +80,17 @@ async def test_without_a_controller_the_camera_says_so(cell: CellTruth) -> None:
 
 async def test_one_that_died_is_opened_again(camera: RenderedCamera) -> None:
     assert camera._workers is not None and camera._workers._pool is not None
+    await camera.capture()
     for process in camera._workers._pool._processes.values():
         process.kill()
     with raises("camera-gone"):
         await camera.capture()
     await camera.capture()
+    looking = asyncio.create_task(camera.glimpse())
+    await until(lambda: camera._workers.waiting)
+    looking.cancel()  # as of a screen that closes
+    await camera.capture()
+    assert camera.counts().missing == 0, "it is still the same, and counts from its own first image"
 
 
 async def test_one_that_is_closed_during_a_capture_stays_closed(camera: RenderedCamera) -> None:

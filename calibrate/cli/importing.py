@@ -19,7 +19,7 @@ from calibrate.job import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, import_bag
-from recordings.importers.bags import BAGS
+from recordings.importers.bags import BAGS, UNFINISHED
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
 from recordings.importers.folder import Imported, import_folder, write_views
 from recordings.importers.messages import Progress
@@ -95,7 +95,10 @@ def import_command(
     with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
         if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
-        elif source.exists() and not any(path.name.endswith(BAGS) for path in [source, *source.glob("*")]):
+        elif source.exists() and not (
+            source.name.endswith(UNFINISHED)  # beside pictures it is only left over
+            or any(path.suffix in BAGS for path in [source, *source.glob("*")])
+        ):
             held = look(source, poses)
             told = read_dataset(dataset)[0] if dataset else _told(held.root, output)
             given = Given(convention, mount, None if board is None else typed_board(board))

@@ -18,9 +18,10 @@ from recordings.mcap.scan import scan_file
 from recordings.mcap.source import Source
 from recordings.schema.definitions import SESSION_RECORDS
 
-_UNFINISHED = ".mcap" + PART_SUFFIX
-BAGS = (".mcap", _UNFINISHED, ".bag", ".db3", ".zstd")
-"""Ends of the names of files of bags, and of a recording that was not finished."""
+UNFINISHED = ".mcap" + PART_SUFFIX
+"""End of the name of a recording that was not finished."""
+BAGS = (".mcap", ".bag", ".db3", ".zstd")
+"""Suffixes of files of bags."""
 _RESCUE = "mcap recover FILE, with the mcap command line tool"
 _SHOWN_EVERY = 64
 """Messages between two reports of progress."""
@@ -108,7 +109,7 @@ class _McapBag(Bag):
             descriptor = open_file(path)
             try:
                 told = partial(self._checked, done, total)
-                rescue = "" if path.name.endswith(_UNFINISHED) else _RESCUE
+                rescue = "" if path.name.endswith(UNFINISHED) else _RESCUE
                 contents, source, _ = scan_file(descriptor, path, rescue, told)
                 if SESSION_RECORDS[0] in contents.metadata:
                     raise ImportSourceError("a-recording", path=path)

@@ -181,7 +181,7 @@ def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_pa
     assert told.returncode == 0, told.stderr
     assert json.loads(told.stdout)["found"]["mount"][0] == "eye-in-hand"
     first = open_recording(out)
-    out.unlink()
+    out.rename(folder / "killed.mcap.part")  # an import into the folder that was killed
     assert call(main, "import", folder, "-o", out).returncode == 0
     assert open_recording(out).views() == first.views()
     assert first.info.mount == "eye-in-hand"

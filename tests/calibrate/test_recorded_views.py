@@ -17,6 +17,7 @@ from calibrate.geometry import pose, rotation_exp
 from calibrate.job import solve_recording
 from calibrate.kinematics import forward
 from calibrate.recorded_views import arm_of_ros, load_views
+from calibrate.report import html
 from calibrate.report.page import report_page
 from recordings.errors import MissingSegmentError
 from recordings.images import encode_png
@@ -108,6 +109,8 @@ def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Record
     assert loaded.without_board[0].reason in page
     assert page.count(" px</title></rect>") == 6
     assert re.search(rf'class="largest" \S+ y="0" \S+ height="{largest_px:.4g}"', page)
+    near, far = (html.bars({0: 1.0, 2: 0.5}, "px", limit) for limit in (3.0, 4.0))
+    assert 'class="limit"' in near and 'class="limit"' not in far
 
 
 def test_leaving_out_a_view_that_shows_no_board_is_fine(source: Recording, tmp_path: Path) -> None:

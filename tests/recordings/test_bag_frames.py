@@ -96,6 +96,11 @@ def test_an_arm_that_drifts_slowly_does_not_stand() -> None:
     fast = np.array([900_000_000, 1_900_000_000], np.int64), np.array([0.0, 0.1])
     (stop,) = replace(finder, speeds=fast).stops(wide)[0]
     assert stop.place == 0, "a joint turned before the second image"
+    (stop,) = replace(finder, images_ns=images[::-1]).stops(wide)[0]
+    assert stop.place == 0, "the latest, in whatever order they came"
+    (rare := FrameTree()).add([frame(n * 10**8, "base", "flange", turned(0.1 * (n < 5))) for n in range(40)])
+    finder = replace(finder, track=rare.track("base", "flange"))
+    assert len(finder.stops(StandstillLimits())[0]) == 1, "it reports at 10 Hz"
 
 
 def test_limits_come_from_an_arm_that_reports_with_more_noise() -> None:

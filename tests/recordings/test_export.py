@@ -120,13 +120,15 @@ def test_a_bag_tells_flange_and_images_as_they_were_recorded(tmp_path: Path) -> 
         mosaic = msgspec.structs.replace(make_picture(1), pixel_format="BayerGR8")
         for index, each in enumerate([(make_picture(0),), (mosaic, encode_png(make_image(1)))]):
             writer.image(*each)
-            writer.view(msgspec.structs.replace(make_view(index), stamps=Stamps()))  # as imported
+            stamps = Stamps() if index else Stamps(1, START_NS + 2 * 10**9)  # as imported, or taken again
+            writer.view(msgspec.structs.replace(make_view(index), stamps=stamps))
         recording = open_recording(writer.finish())
     bag = open_bag(export_recording(recording, tmp_path / "out", "ros2"))
     (raw,), (file,) = map(bag.images, ("/camera/image_raw", "/camera/image_raw/compressed"))
     assert (raw.encoding, file.encoding) == ("mono8", "bayer_grbg8")
-    assert [raw.stamp_ns, file.stamp_ns] == [START_NS, START_NS + 10**9], "those without a time are in order"
+    assert [raw.stamp_ns, file.stamp_ns] == [START_NS + 2 * 10**9, START_NS + 10**9]
     first, *others = (frame for told in bag.values("/tf") for frame in told)
+    assert [frame.stamp_ns - START_NS for frame in others] == [10**7, 10**9, 2 * 10**9]
     flange = base_from_flange(make_state(0).tcp_pose, tool)
     np.testing.assert_allclose(first.position_m, [row[3] for row in flange[:3]])
     assert len(others) == 3, "at 0 and 10 ms, and of two views"

@@ -249,7 +249,10 @@ def test_a_source_that_is_none_is_named_before_what_it_lacks(small: Path) -> Non
     missing = small.with_name("none.mcap")
     for source, code in ((part, "unfinished-recording"), (small, "a-recording"), (missing, "no-file")):
         told = call(main, "import", source, "-o", small.with_name("out.mcap"), "--json")
-        assert json.loads(told.stdout)["error"]["code"] == code
+        error = json.loads(told.stdout)["error"]
+        assert error["code"] == code and error["values"].get("rescue", "").startswith(
+            "recordings recover" * (source == part)
+        )
 
 
 DOCUMENT = Path(__file__).parent.parent.parent / "docs/integrator/import.md"

@@ -69,7 +69,8 @@ def test_a_part_that_held_nothing_is_not_missing(session: Path, listed: bool) ->
     (session / "session-2.mcap").unlink()
     (session / "session-2.mcap.part").write_bytes(b"\x89MCAP0\r\n")
     recover_recording(session)
-    assert [part.info.part for part in open_recording(session).segments] == [1, 3]
+    opened = open_recording(session)
+    assert ([part.info.part for part in opened.segments], opened.losses) == ([1, 3], ())
 
 
 @pytest.mark.parametrize(("name", "left_as"), [("session-3.mcap", ""), ("session-2.mcap", ".part")])

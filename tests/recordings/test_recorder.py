@@ -241,7 +241,7 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
     monkeypatch.undo()  # space is free again, and still nothing more is written
     assert not recorder.robot_state(make_state(0))
     for call in (
-        lambda: recorder.image(make_picture(2)),
+        *[lambda: recorder.image(make_picture(2))] * recorder_module.IMAGES_LIMIT,
         lambda: recorder.view(make_view(2)),
         lambda: recorder.event(event()),
         lambda: recorder.sync().result(PATIENCE_S),
@@ -286,15 +286,19 @@ async def test_a_task_that_stops_waiting_does_not_harm_the_recording(gate: Gate,
     waiting.cancel()
     gate.opened.set()
     recorder.image(make_picture(0))
-    assert open_recording(await asyncio.wrap_future(recorder.finish())).segments[0].image_sequences() == [0]
+    assert (finished := recorder.finish()) is recorder.finish()
+    assert open_recording(await asyncio.wrap_future(finished)).segments[0].image_sequences() == [0]
 
 
-def test_closing_leaves_the_part_file_for_recovery(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "a.mcap", make_info())
+def test_closing_writes_what_waits_and_leaves_the_part_file_for_recovery(gate: Gate, tmp_path: Path) -> None:
+    recorder = held_up(gate, tmp_path)
     recorder.image(make_picture(0))
+    (closing := threading.Thread(target=recorder.close)).start()
+    wait_until(lambda: not recorder.robot_state(make_state(0)))
+    gate.opened.set()
+    closing.join()
     recorder.close()
-    recorder.close()
-    assert recorder.part_path.exists()
+    assert make_picture(0).pixels.tobytes() in recorder.part_path.read_bytes()
     with refused("closed"):
         recorder.event(event())
     with refused("closed"):

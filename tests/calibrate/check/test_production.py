@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from calibrate.check.history import read_checks
 from calibrate.check.production import EARLIER, NEWEST, EarlierPictures, check_production
 from calibrate.cli import main
 from calibrate.errors import BadViewsError, TooFewViewsError
@@ -116,6 +117,7 @@ def test_a_folder_that_grows_puts_a_moved_camera_in_doubt(root: Path, tmp_path: 
     moved = call(main, "drift-check", production.folder, "--root", root, "--json")
     told = json.loads(moved.stdout)
     assert moved.returncode == 4 and not told["passed"] and told["views"] <= 10
+    assert told["validity"]["state"] != ValidityState.VALID and not read_checks(root)
     few = Production(tmp_path / "few", root)
     few.take(4)
     assert call(main, "drift-check", few.folder, "--root", root).returncode == 1

@@ -151,8 +151,9 @@ def test_a_touch_test_does_not_begin_the_trend_anew(real_file: Path, tmp_path: P
     check = ("--root", root, "--json")
     later = Scene(views=6, seed=17)
     new = write_session(tmp_path / "new.mcap", later, known_lens=True, source="real", name="later")
-    assert not json.loads(run("drift-check", new, *check, cwd=tmp_path).stdout)["trend"]
+    told = json.loads(run("drift-check", new, *check, cwd=tmp_path).stdout)
     (first,) = read_checks(root)
+    assert not told["trend"] and first.p_value == told["p_value"]
     for week in range(1, 5):
         right = tuple(1e4 * week + value for value in first.right)
         append_check(msgspec.structs.replace(first, wall_s=first.wall_s - 6e5 * week, right=right), root)

@@ -61,7 +61,10 @@ def test_the_table_with_its_own_x_is_best_at_new_poses(worn: Worn, solved: Solut
     table = table_of(solved)
     assert table.offered
     nominal, corrected = forward(UR10, worn.new_joints), table.chain.forward(worn.new_joints)
-    both = spread(corrected, solved.matrix, worn.new_board_poses)
+    both = spread(corrected, table.result.transform.matrix, worn.new_board_poses)
+    np.testing.assert_array_equal(table.result.transform.matrix, solved.matrix)
+    q = np.array([view.joints_rad for view in worn.views.views])
+    np.testing.assert_array_equal(table.joints_rad, np.transpose([q.min(axis=0), q.max(axis=0)]))
     uncorrected = spread(nominal, as_it_is(solved).X, worn.new_board_poses)
     assert both < 0.6 * uncorrected
     assert table.with_table_mm < 0.7 * table.without_table_mm

@@ -19,10 +19,10 @@ HEAVY = ("numpy", "cv2", "matplotlib", "google", "mcap_protobuf", "scipy", "rosb
 SCREEN = ("numpy", "scipy", "cv2", "textual", "calibrate")
 HARDWARE = ("textual", "serial", "rtde_control", "gi")
 NOT_LOADED = {
-    "import recordings, calibrate, calibrate.handeye": HEAVY,
-    "import recordings.cli.app": HEAVY,
+    "import recordings.cli.app, calibrate, calibrate.handeye": HEAVY,
     "import calibrate.job, calibrate.cli.importing, recordings.cli.commands": (*HARDWARE, "station"),
-    "import station.daemon": ("scipy.spatial", "scipy.sparse", "matplotlib", "textual"),
+    "import station.daemon": ("scipy", "matplotlib", "textual"),
+    "import station.tui.app": ("scipy", "matplotlib", "station.session"),
     "calibrate --help": HEAVY,
     "station --help": (*SCREEN, "station.operate", "asyncio"),
     "station status --help": (*SCREEN, "station.simulation", "station.plan"),

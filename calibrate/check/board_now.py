@@ -12,13 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibrate.boards.model import board_points
-from calibrate.check.drift import stated_cell
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, skew
 from calibrate.handeye.cell_state import Layout
-from calibrate.handeye.estimate import estimate
-from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.reprojection import bent_points
 from calibrate.lens.pnp import candidate_poses
 from calibrate.views import BoardView, ViewSet, observe_views
@@ -45,6 +42,9 @@ def locate_board(calibration: Calibration, view: BoardView) -> BoardNow:
     Raises BadViewsError where the tilt is ambiguous, where the board is still on the flange (eye-to-hand), or
     for a calibration that states no noise.
     """
+    from calibrate.check.drift import stated_cell  # the solver: 0.2 s that no screen need wait for
+    from calibrate.handeye.estimate import estimate
+
     in_hand, known = calibration.mount == "eye-in-hand", stated_cell(calibration)
     covariance = _EXACTLY**2 * np.eye(len(known.covariance))
     covariance[:6, :6] = calibration.covariance
@@ -53,10 +53,13 @@ def locate_board(calibration: Calibration, view: BoardView) -> BoardNow:
         known = replace(known, scales=replace(known.scales, robot=np.full(2, _EXACTLY)))
     flange = view.base_from_flange if in_hand else np.eye(4)
     readings = candidate_poses(view, known.mean.camera, calibration.board)
-    at = []
+    prior, at = known.prior(camera_may_have_moved=False), []
     for reading in readings:
         seen = replace(view, base_from_flange=flange, camera_from_board=reading.camera_from_board)
-        at.append(_located(known, ViewSet(calibration.mount, (seen,), known.mean.camera)))
+        views = ViewSet(calibration.mount, (seen,), known.mean.camera)
+        found = estimate(known.observe(views), known.start(views), prior, known.scales, fit="nothing")
+        rows = Layout.of(found.state).Y
+        at.append(BoardNow(found.state.Y, found.covariance[rows, rows]))
     place, E = np.array(calibration.board_place.matrix), view.base_from_flange
     misses = [difference(b.base_from_board if in_hand else inverse(E) @ b.base_from_board, place) for b in at]
     near = (_SAME_PLACE_M, _SAME_PLACE_RAD)
@@ -67,13 +70,6 @@ def locate_board(calibration: Calibration, view: BoardView) -> BoardNow:
     if not same and any(np.linalg.norm(difference(t, tilts[0])[3:]) > _SAME_TILT_RAD for t in tilts):
         raise BadViewsError("ambiguous-tilt")
     return at[same[0] if same else 0]
-
-
-def _located(known: KnownCell, view: ViewSet) -> BoardNow:
-    prior = known.prior(camera_may_have_moved=False)
-    found = estimate(known.observe(view), known.start(view), prior, known.scales, fit="nothing")
-    at = Layout.of(found.state).Y
-    return BoardNow(found.state.Y, found.covariance[at, at])
 
 
 def found_points(calibration: Calibration) -> Array:
@@ -94,6 +90,8 @@ def offset_covariance(
     First order in the errors of the board's pose and of the robot at the corner, whose noise is the one that
     the calibration estimated. `corner_m` (3,) in `board`, `tip_m` (3,) in `flange`. Raises as `locate_board`.
     """
+    from calibrate.check.drift import stated_cell
+
     robot_m, robot_rad = stated_cell(calibration).scales.robot
     R = now.base_from_board[:3, :3]
     J = np.concatenate([np.eye(3), -skew(R @ np.asarray(corner_m))], axis=1)

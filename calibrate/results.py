@@ -75,9 +75,9 @@ class Gate(msgspec.Struct, frozen=True):
     @property
     def narrow(self) -> bool:
         """True when passed with a warning, or with less than a tenth of the limit to spare."""
-        if not self.passed or self.value is None or not self.limit:
-            return self.passed and bool(self.remedy)
-        return abs(self.value / self.limit - 1) <= _NARROW
+        if not self.passed or self.remedy:
+            return self.passed
+        return bool(self.value is not None and self.limit and abs(self.value / self.limit - 1) <= _NARROW)
 
 
 class RejectedView(msgspec.Struct, frozen=True, omit_defaults=True):

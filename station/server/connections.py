@@ -150,6 +150,8 @@ class ClientServer:
         reader, writer = await asyncio.open_unix_connection(sock=link, limit=LINE_LIMIT_BYTES)
         connection = _Connection(peer, reader, writer, self._handler, self.publish)
         self._connections.add(connection)
+        if self._listening is None:  # closed since it was let in
+            connection.drop("the daemon ends")
         try:
             await connection.run()
         finally:

@@ -271,3 +271,13 @@ async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None
     async with asyncio.timeout(PATIENCE_S):
         assert len([s async for s in statuses]) <= 1
     await client.close()
+
+
+async def test_a_daemon_that_ends_waits_for_no_client_that_it_has_just_let_in(server: Served) -> None:
+    control, path = server
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.connect(str(path))
+        control._accept()  # in the round in which it ends
+        async with asyncio.timeout(PATIENCE_S):
+            await control.close()
+        assert b"the daemon ends" in silent.recv(4096)

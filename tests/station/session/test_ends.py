@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 import threading
 import time
 from typing import Any
@@ -207,6 +209,14 @@ async def test_a_call_that_hangs_costs_its_own_answer_only_and_nobody_waits_for_
     workers.close()
     results = await asyncio.gather(*calls, return_exceptions=True)
     assert [type(result) for result in results] == [WorkerError] * 2 and workers._pool is None
+
+
+async def test_a_worker_that_freezes_before_it_reads_an_image_leaves_no_thread() -> None:
+    workers, before = Workers(start_worker), threading.active_count()
+    os.kill(await workers.call(os.getpid), signal.SIGSTOP)
+    with raises("worker-late"):
+        await workers.call(len, bytes(2**20), timeout_s=0.2)
+    await until(lambda: threading.active_count() <= before)
 
 
 async def test_nothing_begins_once_the_daemon_ends(rig: Rig) -> None:

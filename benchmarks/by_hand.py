@@ -28,7 +28,7 @@ from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import camera_matrix, distortion, project_pixels
+from calibrate.projection import camera_matrix, distortion, project
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from recordings.schema.stillness import WINDOW_S, scatter
@@ -133,7 +133,7 @@ def goal(cell: ArmCell, wanted: NextView, rng: np.random.Generator) -> Array:
     middle = transform_points(C := pose(cv2.Rodrigues(r)[0], t.ravel()), POINTS.mean(axis=0))
     R = rotation_exp(off[3:])
     C = pose(R, middle + off[:3] - R @ middle) @ C
-    home, wanted_px = np.array(HOME[cell.arm.name]), project_pixels(CAMERA, transform_points(C, RIM))
+    home, wanted_px = np.array(HOME[cell.arm.name]), project(CAMERA, transform_points(C, RIM)).pixels
     reached = least_squares(
         lambda q: (placed_px(cell, q) - wanted_px).ravel(), home, bounds=(home - REACH_RAD, home + REACH_RAD)
     )
@@ -143,7 +143,7 @@ def goal(cell: ArmCell, wanted: NextView, rng: np.random.Generator) -> Array:
 def placed_px(cell: ArmCell, q: Array) -> Array:
     (C,) = boards(cell.arm.forward(q[None]), cell.views.mount, cell.X, cell.Y)
     points = transform_points(C, RIM)
-    return project_pixels(CAMERA, np.maximum(points, [-np.inf, -np.inf, 0.05]))
+    return project(CAMERA, np.maximum(points, [-np.inf, -np.inf, 0.05])).pixels
 
 
 def move(q: Array, there: Array, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -168,7 +168,7 @@ def still(cell: ArmCell, path: Array, C: Array) -> Array:
     """Tell (n,) where the station's rule holds: flange over its window, corners over as long."""
     limits, window = StillnessConfig(), round(WINDOW_S * RATE_HZ)
     flange, rests = cell.arm.forward(path), np.zeros(len(path), dtype=bool)
-    pixels = np.array([project_pixels(CAMERA, transform_points(each, POINTS)) for each in C])
+    pixels = np.array([project(CAMERA, transform_points(each, POINTS)).pixels for each in C])
     for at in range(window, len(path)):
         place_m, turn_rad = scatter(flange[at - window : at + 1])
         motion_px = max(np.linalg.norm(pixels[at] - pixels[at - k], axis=1).max() for k in (2, 5, 10, 15))

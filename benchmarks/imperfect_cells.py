@@ -18,7 +18,7 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.kinematics import MODELS, forward
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from tests.calibrate.cells import inverse_nearest
@@ -102,7 +102,7 @@ def imperfect_cell(
     lens, stated = LENSES[model], grid(9, 7, 0.025)
     told, joints, X, Y, C = _poses(rng, mount, wrong, lens, stated, views)
     real = _real_points(rng, wrong, stated)
-    pixels = project_pixels(lens, transform_points(C, real))
+    pixels = project(lens, transform_points(C, real)).pixels
     pixels = pixels + noise.corner_px * rng.normal(size=pixels.shape) + _bias(rng, wrong, stated, views)
     sigma = np.repeat([noise.robot_m, noise.robot_rad], 3)
     flange = perturb(told, sigma * rng.normal(size=(views, 6)))
@@ -162,7 +162,7 @@ def look(rng: np.random.Generator, lens: CameraModel, board: Array) -> Array:
         depth = rng.uniform(0.4, 0.62)
         aim = rng.uniform(-0.45, 0.45, 2) * size / K[0, 0] * depth
         C = pose(R, np.array([*aim, depth]) - R @ centre)
-        pixels = project_pixels(lens, transform_points(C, board))
+        pixels = project(lens, transform_points(C, board)).pixels
         if (pixels > 10).all() and (pixels < size - 10).all():
             return C
 

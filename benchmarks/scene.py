@@ -23,7 +23,7 @@ from calibrate.geometry import (
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
 
@@ -80,7 +80,7 @@ def make_cell(
     flange = Y @ inverse(C) @ inverse(X) if mount == "eye-in-hand" else X @ C @ inverse(Y)
     sigma = np.repeat([noise.robot_m, noise.robot_rad], 3)
     measured = perturb(flange, rng.normal(size=(views, 6)) * sigma)
-    exact = project_pixels(camera, transform_points(C, board))
+    exact = project(camera, transform_points(C, board)).pixels
     pixels = exact + rng.normal(size=exact.shape) * noise.corner_px
     seen = tuple(BoardView(i, f"view {i}", measured[i], board, pixels[i], None, C[i]) for i in range(views))
     found = ViewSet(mount, seen, camera)
@@ -108,7 +108,7 @@ def _look(rng: np.random.Generator, camera: CameraModel, board: Array) -> Array:
         depth = rng.uniform(0.38, 0.60)
         target = np.array([*(rng.uniform(-0.12, 0.12, 2) * depth), depth])
         C = pose(R, target - R @ centre)
-        seen = project_pixels(camera, transform_points(C, board))
+        seen = project(camera, transform_points(C, board)).pixels
         if (seen > 10).all() and (seen < [camera.width - 10, camera.height - 10]).all():
             return C
     raise RuntimeError("the board does not fit into the picture")

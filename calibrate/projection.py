@@ -59,11 +59,6 @@ def project(camera: CameraModel, points: Array) -> Projected:
     return Projected(pixels.reshape(*shape, 2), by_point.reshape(*shape, 2, 3), own.reshape(*shape, 2, p))
 
 
-def project_pixels(camera: CameraModel, points: Array) -> Array:
-    """Compute the pixels (..., 2) of points (..., 3) in `camera`, metres."""
-    return project(camera, points).pixels
-
-
 def camera_matrix(camera: CameraModel) -> Array:
     """Return K (3, 3); BadViewsError where it is missing or not a camera matrix."""
     if camera.matrix is None:
@@ -119,7 +114,7 @@ def distortion(camera: CameraModel) -> Array:
 
 def project_at(camera: CameraModel, camera_from_board: Array, points: Array) -> Array:
     """Project points (n, 3) of `board` to pixels (n, 2)."""
-    return project_pixels(camera, transform_points(camera_from_board, np.asarray(points, dtype=float)))
+    return project(camera, transform_points(camera_from_board, np.asarray(points, dtype=float))).pixels
 
 
 def undistort(camera: CameraModel, pixels: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, skew
-from calibrate.projection import intrinsics_names, project, project_pixels
+from calibrate.projection import intrinsics_names, project
 from calibrate.results import SHAPE
 from calibrate.views import Observations
 from recordings.schema.messages import CameraModel
@@ -91,7 +91,7 @@ def corner_residuals(
         return np.zeros_like(observed.pixels)
     points = observed.points if shape is None else bent_points(observed, shape)
     _, p = _in_camera(observed, points, C)
-    return np.where(observed.present[..., None] > 0, observed.pixels - project_pixels(camera, p), 0.0)
+    return np.where(observed.present[..., None] > 0, observed.pixels - project(camera, p).pixels, 0.0)
 
 
 def corner_distance(residuals: Array) -> Array:

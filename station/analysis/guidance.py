@@ -23,7 +23,7 @@ from calibrate.handeye.information import (
 )
 from calibrate.handeye.metrics import median_distance_m
 from calibrate.lens.pnp import candidate_poses, solve_pnp
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from calibrate.views import ViewSet, implied_flange
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import as_views
@@ -70,7 +70,7 @@ class NextView:
     @property
     def outline(self) -> Array:
         """Corners (4, 2), px, of the board in the wanted view, in order around it."""
-        return project_pixels(self.camera, transform_points(self.camera_from_board, rim(self.board)))
+        return project(self.camera, transform_points(self.camera_from_board, rim(self.board))).pixels
 
     @property
     def drawn(self) -> tuple[tuple[float, float], ...]:
@@ -154,7 +154,7 @@ def way_to(wanted: NextView, seen: CapturedView) -> Way:
     middle = board_points(board).mean(axis=0)
     new = min(_least_difference(C, wanted.seen, middle) for C in readings) >= 1.0
     now, then = (transform_points(C, middle) for C in (readings[nearest], target))
-    pixels = project_pixels(lens, np.array([now, then]))
+    pixels = project(lens, np.array([now, then])).pixels
     shift = (pixels[1] - pixels[0]) / max(lens.width, lens.height)
     further_m = float(np.linalg.norm(then) - np.linalg.norm(now))
     if abs(further_m) < _NEAR_SHARE * np.linalg.norm(now):

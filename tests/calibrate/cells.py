@@ -19,7 +19,7 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.kinematics import RobotModel, inverse_many
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from calibrate.views import BoardView, ViewSet, implied_flange
 from recordings.schema.messages import CameraModel, Mount
 
@@ -85,7 +85,7 @@ def real_cell(
     pictures = []
     for view, C in zip(cell.views, cell.C, strict=True):
         bent = printed(view.board_points, shape)
-        pixels = project_pixels(camera, bent @ C[:3, :3].T + C[:3, 3])
+        pixels = project(camera, bent @ C[:3, :3].T + C[:3, 3]).pixels
         pixels = pixels + rng.normal(size=pixels.shape) * noise.corner_px
         pixels = pixels + smooth_bias(rng, view.board_points, bias_px)
         pictures.append(replace(view, pixels=pixels))

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
 
@@ -146,7 +146,7 @@ def views_at(
     true[:, :3, 3] += noise[:, :3]
     seen = []
     for i, C in enumerate(boards(true, mount, X, Y)):
-        pixels = project_pixels(CAMERA, transform_points(C, POINTS)) + 0.15 * rng.normal(
+        pixels = project(CAMERA, transform_points(C, POINTS)).pixels + 0.15 * rng.normal(
             size=(len(POINTS), 2)
         )
         told = arm.forward(q[i : i + 1])[0]

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from calibrate.views import board_in_camera
 from station.simulation.truth import CellTruth
 
@@ -19,5 +19,5 @@ def board_seen(truth: CellTruth, base_from_flange: Array) -> Array:
 
 def corners_seen(truth: CellTruth, camera_from_board: Array, rng: np.random.Generator) -> Array:
     """Pixels (n, 2) of all corners, with noise of 0.1 px."""
-    pixels = project_pixels(truth.camera, transform_points(camera_from_board, board_points(truth.board)))
+    pixels = project(truth.camera, transform_points(camera_from_board, board_points(truth.board))).pixels
     return np.asarray(pixels + rng.normal(0, 0.1, pixels.shape))

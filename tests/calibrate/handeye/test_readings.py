@@ -17,7 +17,7 @@ from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import solve_views
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from tests.calibrate.cells import (
     HIGH,
     LOW,
@@ -71,7 +71,7 @@ def refocused(c):
 
     def pixels(view):
         C = c.C[view.index]
-        return project_pixels(lens, view.board_points @ C[:3, :3].T + C[:3, 3])
+        return project(lens, view.board_points @ C[:3, :3].T + C[:3, 3]).pixels
 
     return seen_through(changed(c.views, list(range(HALF, len(c.views))), pixels=pixels), c.camera)
 

@@ -10,7 +10,7 @@ from benchmarks.scene import random_rotation
 from calibrate.boards.model import board_from_turned, board_points
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_angle, transform_points
 from calibrate.lens.pnp import candidate_poses, choose_candidates, solve_pnp
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from tests.calibrate.sessions import looking
@@ -81,7 +81,7 @@ def test_one_sure_picture_does_not_decide_for_the_doubtful_ones() -> None:
     while len(views) < 13:
         far = len(views) >= 8
         C = looking(MARKED, rng, (0.1, 0.25) if far else (0.3, 0.6), 4.0 if far else 0.4, np.pi)
-        pixels = project_pixels(CAMERA, transform_points(C, points)) + rng.normal(size=(len(points), 2)) * 0.3
+        pixels = project(CAMERA, transform_points(C, points)).pixels + rng.normal(size=(len(points), 2)) * 0.3
         view = BoardView(len(views), "", P @ inverse(X @ C), points, pixels)
         readings = [found.camera_from_board for found in candidate_poses(view, CAMERA, MARKED)]
         off = [float(rotation_angle(found[:3, :3].T @ C[:3, :3])) for found in readings]

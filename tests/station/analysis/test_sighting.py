@@ -11,7 +11,7 @@ import recordings
 from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
 from calibrate.geometry import transform_points
-from calibrate.projection import project_pixels
+from calibrate.projection import project
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.analysis import worker
@@ -62,7 +62,7 @@ def test_distance_and_tilt_are_those_by_a_fisheye_lens(monkeypatch: pytest.Monke
         640, 512, ((250.0, 0, 320), (0, 250.0, 256), (0, 0, 1)), (0.2, -0.1, 0.0, 0.0), "equidistant"
     )
     points, C = board_points(PAPER_BOARD), seen_from(PAPER_BOARD, 0.2)
-    pixels = project_pixels(lens, transform_points(C, points))
+    pixels = project(lens, transform_points(C, points)).pixels
     seen = Detection("", "", np.arange(len(points)), pixels, len(points), 640, 512, 0.0, 0.5)
     monkeypatch.setattr(worker, "detect", lambda *_: seen)
     status = sight(np.zeros((512, 640), np.uint8), PAPER_BOARD, lens, False).status

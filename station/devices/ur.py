@@ -21,7 +21,7 @@ from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
 from station.cell.stillness import RESTING_RAD_S
 from station.devices.base import fresh, ready
-from station.devices.news import RESTING_S
+from station.devices.news import RESTING_S, Delay
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import arm_held, control_ended, foreign_program
@@ -197,6 +197,8 @@ class UrRobot(UrLink):
                 await asyncio.shield(self.stop(str(cause) or type(cause).__name__))
             if isinstance(cause, RobotError):
                 cause = await cause_of_end(self, child, cause)
+                if self._link_loss and cause.code in set(Delay):  # heard of only now: nothing else was late
+                    cause = link_lost(self._link_loss)
             raise cause from None
         finally:
             self._moving, self._watch, self._one_way_s = False, None, None

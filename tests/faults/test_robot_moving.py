@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from station.cell.errors import RobotError, SafetyStopError
+from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.base import ready
 from station.devices.news import Delay
+from station.devices.ur import UrRobot
 from station.devices.ur_child import ControlChild
 from tests.codes import raises
 from tests.faults.conftest import Cell, MakeCell, child_gets
@@ -72,9 +73,10 @@ async def test_fault(cell: MakeCell, name: str) -> None:
     c = await cell("UR10e" if code == "local-control" else "UR10")
     child_pid = c.control_pid
     error = await c.strike(fault)
-    late_too = (
-        name == "program stopped" and error.code == Delay.CONTROLLER
-    )  # where a busy computer simulates it
+    late_too = (name, error.code) == (
+        "program stopped",
+        Delay.CONTROLLER,
+    )  # on a busy computer
     assert error.code == code or late_too, error
     if code == "stale-state":
         await c.ask(**fault, on=False)
@@ -83,6 +85,20 @@ async def test_fault(cell: MakeCell, name: str) -> None:
     await c.stays_at_rest(1.0 if code == "link-lost" else 0.2)
     with pytest.raises(ProcessLookupError):
         os.kill(child_pid, 0)
+
+
+async def test_a_connection_heard_of_as_lost_only_later_is_what_is_told(
+    cell: MakeCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The control process loses its own connection first: then nothing resets the watchdog any more."""
+
+    async def heard_meanwhile(link: UrRobot, *_: object) -> RobotError:
+        link.on_link_lost("the robot closed the connection")
+        return StaleStateError(Delay.COMPUTER)
+
+    c = await cell()
+    monkeypatch.setattr("station.devices.ur.cause_of_end", heard_meanwhile)
+    assert (await c.strike({"cmd": "stop_program"})).code == "link-lost"
 
 
 @pytest.mark.parametrize(

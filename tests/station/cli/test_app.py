@@ -92,23 +92,27 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
     assert shell.ask("retake", "2")[0] == 0 and shell.state()["session"]["poses"][1]["kept"]
     assert shell.ask("skip", "2")[0] == 0 and "kept" not in shell.state()["session"]["poses"][1]
 
-    # Ctrl-C is STOP, and so is Ctrl-Z, behind which nobody would watch.
-    command = [sys.executable, "-m", "station.cli", "capture", "--plan", str(plan), "--headless"]
     for key in (signal.SIGINT, signal.SIGTSTP):
-        capture = subprocess.Popen(
-            [*command, "--socket", str(shell.socket)],
-            stdin=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        wait_until(lambda: shell.state()["state"] in RUNNING)
-        capture.send_signal(key)
-        said = capture.communicate(timeout=PATIENCE_S)[1]
-        assert capture.returncode == 130 and "station acknowledge" in said
-        status = shell.state()
-        assert (status["state"], status["cause"]) == ("stopped", "stop")
-        assert shell.ask("acknowledge")[0] == 0
-        shell.ask("finish")
+        is_stop(shell, plan, key)
+
+
+def is_stop(shell: Shell, plan: Path, key: signal.Signals) -> None:
+    """Ctrl-C is STOP, and so is Ctrl-Z, behind which nobody would watch."""
+    command = [sys.executable, "-m", "station.cli", "capture", "--plan", str(plan), "--headless"]
+    capture = subprocess.Popen(
+        [*command, "--socket", str(shell.socket)],
+        stdin=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_until(lambda: capture.poll() is not None or shell.state()["state"] in RUNNING)
+    capture.send_signal(key)
+    said = capture.communicate(timeout=PATIENCE_S)[1]
+    assert capture.returncode == 130 and "station acknowledge" in said, said
+    status = shell.state()
+    assert (status["state"], status["cause"]) == ("stopped", "stop")
+    assert shell.ask("acknowledge")[0] == 0
+    wait_until(lambda: shell.ask("finish")[0] == 0 or shell.state()["state"] == "idle")
 
 
 def test_a_session_with_loss_names_what_is_missing_and_ends_with_3(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points, typed_board
-from calibrate.geometry import difference
+from calibrate.geometry import difference, pose
 from recordings.schema.messages import BoardKind, Image, Mount, RobotIdentity, Stamps
 from station.analysis.found_cell import FoundCell
 from station.cell.config import CameraChoice
@@ -90,10 +90,10 @@ def test_what_was_written_is_read_back_and_can_be_planned(
     assert config.working_distance_m == pytest.approx(away_m, abs=0.005)
     cameras = flanges @ layout.X if draft.mount == "eye-in-hand" else flanges
     at = np.concatenate([flanges, cameras])[:, :3, 3]
-    room_m = np.array(
-        [(at.min(axis=0) - limits.workspace_min_m)[:2], (limits.workspace_max_m - at.max(axis=0))[:2]]
-    )
-    assert room_m.min() > flow._ROOM_M - 0.002, "around the camera, too"
+    below_m, above_m = at.min(axis=0) - limits.workspace_min_m, limits.workspace_max_m - at.max(axis=0)
+    assert min(*below_m[:2], *above_m[:2]) > flow._ROOM_M - 0.002, "around the camera, too"
+    sunk = Mock(Y=pose(np.eye(3), [0.0, 0.0, -1.0]) @ draft.found.Y)
+    assert (flow.table_height_m(draft, sunk) < -0.1) == (draft.mount == "eye-in-hand"), "below the board"
     group, _ = candidate_pool(layout, PlanOptions(pool=200), None, np.random.default_rng(0))
     assert len(group) >= 75
     with disk_order(monkeypatch) as order:

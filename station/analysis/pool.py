@@ -85,7 +85,8 @@ class Workers:
         if self._pool is pool:
             self._pool = None
         processes = list((pool._processes or {}).values())
-        if processes and not pool._broken:  # else who sends a large argument would wait for ever to be read
+        # A frozen worker does not read: the thread that still sends it a large argument would wait for ever.
+        if processes and not pool._broken:
             pool._call_queue._reader.close()  # type: ignore[attr-defined]
         # No waiting: the event loop sends the arm's heartbeat. The pool's own thread sees them end.
         pool.shutdown(wait=False, cancel_futures=True)

@@ -105,7 +105,10 @@ class Attended:
             return status
 
     def _goes_on(self, cause: str) -> bool:
-        """Whether to approve again after what ended a motion: late news in an unattended simulated cell."""
+        """Tell whether to approve again after what ended a motion, and count it.
+
+        Only after late news, in a simulated cell that nobody attends.
+        """
         unattended = self.simulated and self._headless
         late = cause in set(Delay) and self.approved_again < APPROVED_AGAIN
         self.approved_again += unattended and late

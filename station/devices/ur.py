@@ -197,7 +197,8 @@ class UrRobot(UrLink):
                 await asyncio.shield(self.stop(str(cause) or type(cause).__name__))
             if isinstance(cause, RobotError):
                 cause = await cause_of_end(self, child, cause)
-                if self._link_loss and cause.code in set(Delay):  # heard of only now: nothing else was late
+                # Without a connection nothing resets the watchdog, which looks as if this computer was late.
+                if self._link_loss and cause.code in set(Delay):
                     cause = link_lost(self._link_loss)
             raise cause from None
         finally:

@@ -8,7 +8,7 @@ PYTHON ?= $(or $(SYSTEM_PYTHON),python3)
 VENV_FLAGS := $(if $(SYSTEM_PYTHON),--system-site-packages,)
 READY := $(VENV)/.ready
 
-.PHONY: help venv demo demo-gige test foreign check budget bench pages docs soak install install-files uninstall clean
+.PHONY: help venv demo demo-gige test foreign check bench pages docs soak install install-files uninstall clean
 help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
@@ -35,15 +35,11 @@ demo-gige: $(READY)  ## the same, with the camera over real GigE Vision inside a
 test: $(READY)  ## all tests of our own
 	$(BIN)/python -m pytest -n 4 --dist worksteal --ignore tests/foreign
 
-check: $(READY)  ## ruff, mypy strict, import contracts, budget
+check: $(READY)  ## ruff, mypy strict, import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python tests/budget.py
-
-budget: $(READY)  ## lower budget.toml to today's size
-	$(BIN)/python tests/budget.py --write
 
 # Other people's programs, apart from ours: half a gigabyte, and npm's part only where there is npm.
 FOREIGN := .foreign

@@ -38,12 +38,6 @@ def test_a_made_page_is_fresh(page: str) -> None:
     assert made == (ROOT / "docs" / f"{page}.md").read_text()
 
 
-def test_the_books_have_few_words_in_short_sentences() -> None:
-    """At most 30 words a sentence, 18 on average, 16,200 in all."""
-    done = subprocess.run([sys.executable, ROOT / "docs/sentences.py"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
-
-
 def test_the_books_have_no_dead_link(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", tmp_path / "site"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
@@ -58,12 +52,11 @@ def test_the_functions_that_stop_is_said_to_pass_exist() -> None:
             assert f"def {name.split('.')[-1]}(" in (ROOT / "station" / path).read_text(), (path, name)
 
 
-def test_a_decision_record_is_short_and_whole() -> None:
+def test_a_decision_record_is_whole() -> None:
     for path in (ROOT / "docs/decisions").glob("0*.md"):
         text = path.read_text()
         headings = re.findall(r"^## (.+)$", text, re.MULTILINE)
         assert headings == ["Context", "Decision", "Consequences"], path.name
-        assert len(text.split()) <= 250, path.name
 
 
 def test_the_schemas_are_fresh() -> None:
@@ -73,11 +66,10 @@ def test_the_schemas_are_fresh() -> None:
     assert dict(made) == {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_the_page_of_benchmarks_is_fresh_and_short() -> None:
+def test_the_page_of_benchmarks_is_fresh() -> None:
     """`python -m benchmarks --page` makes it anew from the results."""
     page = (ROOT / "docs/contributor/benchmarks.md").read_text()
     assert page == import_module("benchmarks.__main__").page()
-    assert len(page.split()) < 3500
 
 
 @pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
@@ -86,3 +78,15 @@ def test_a_manual_page_names_every_command(program: str) -> None:
     asked = call(import_module(f"{program}.cli").main, "--all")
     commands = re.findall(r"^\.SS \w+ ([\w-]+)$", page, re.MULTILINE)
     assert len(commands) > 3 and all(command in asked.stdout for command in commands)
+
+
+def test_users_meet_at_most_42_commands() -> None:
+    """The only number that is limited: who adds one more first asks which one nobody would miss."""
+    groups = {name: import_module(f"{name}.cli.app") for name in ("recordings", "calibrate", "station")}
+    commands = [
+        f"{name} {command}"
+        for name, module in groups.items()
+        for command in getattr(module, name.upper()).commands
+    ]
+    assert len(commands) > 30
+    assert len(commands) <= 42, commands

@@ -11,7 +11,7 @@ file's text, which holds `frames.comment` as a comment or a text of its own. A r
 `READERS` of tests/calibrate/files/test_exports.py finds the camera's place by the other program's own rule.
 A library that reads the format judges it in tests/foreign/test_exports.py and is pinned in its
 requirements.txt. Every test of test_exports.py runs on all formats and both mountings. XML is written with
-`models.commented` and `models.numbers`. The number of formats is in budget.toml.
+`models.commented` and `models.numbers`.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from recordings.errors import (
 from recordings.files import PART_SUFFIX
 from recordings.images import Pixels, viewable
 from recordings.manifest import PARTS_LIMIT, Manifest, missing_parts, read_manifest
+from recordings.same_session import difference
 from recordings.schema.messages import (
     BoardSpec,
     CameraModel,
@@ -249,17 +250,15 @@ def _check_one_session(segments: list[RecordingSegment], manifest: Manifest | No
         text = f"{path} is of session '{first.name}', its folder of '{manifest.session}'"
         raise RecordingError("several-sessions", difference=text)
     for segment in segments:
-        if _whose(segment.info) != _whose(first):
-            text = f"{segment.path} and {path} are of different sessions or cameras"
+        if segment.info.name != first.name:
+            text = f"{segment.path} is of session '{segment.info.name}', {path} of '{first.name}'"
             raise RecordingError("several-sessions", difference=text)
+        if (found := difference(first, segment.info)) is not None:
+            text = f"the {found.what} of {segment.path} is {found.other}, that of {path} {found.first}"
+            raise RecordingError("several-sessions", difference=text, **found._asdict())
     for before, segment in pairwise(segments):
         if before.info.part == (part := segment.info.part):
             raise CorruptRecordingError("segment-twice", path=before.path, other=segment.path, segment=part)
-
-
-def _whose(info: SessionInfo) -> tuple[object, ...]:
-    """What all segments of a session have in common."""
-    return info.name, info.mount, info.board, info.source, info.camera, info.camera_identity.serial
 
 
 def _losses(segments: list[RecordingSegment], manifest: Manifest | None) -> tuple[str, ...]:

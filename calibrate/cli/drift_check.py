@@ -90,8 +90,9 @@ def drift_check(
     own, trend, validity, before, unnoted = False, None, None, list[bool](), None
     if not production:
         _require_this_cell(source, info, calibration, root, camera, version)
-    elif (mount := info.mount) != calibration.mount:
-        raise OtherCellError(where=source, differs="mounting", found=mount, calibrated=calibration.mount)
+    else:  # a folder is imported, whatever cell it is of
+        serials = info.robot.serial, info.camera_identity.serial
+        require_same_cell(str(source), calibration, info.mount, calibration.source, *serials)
     known = known_cell(calibration, prepared.loaded.board)
     if production:
         result = check_production(prepared.views, known)

@@ -14,7 +14,8 @@ from pathlib import Path
 import msgspec
 
 from recordings.files import PART_SUFFIX, read_file, session_name_from, sync_folder, write_atomically
-from recordings.schema.messages import Source
+from recordings.same_session import description_of
+from recordings.schema.messages import SessionInfo, Source
 from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
 from station.cell.status import PoseStatus
@@ -42,6 +43,8 @@ class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     check: bool = False
     """True: a drift check of the installed calibration."""
     sealed: bool = False
+    first: SessionInfo | None = None
+    """What the session began with: robot, camera, board, mount and lens; None: unknown, in older files."""
 
 
 class SessionSummary(msgspec.Struct, frozen=True):
@@ -118,7 +121,10 @@ def clear_active(root: Path) -> None:
 
 
 def interrupted_session(root: Path) -> tuple[Path, SessionState] | None:
-    """Find the session that was running when the daemon ended without finishing it; None: none."""
+    """Find the session that was running when the daemon ended without finishing it; None: none.
+
+    Earlier versions did not save what the session began with: then its first segment says so.
+    """
     try:
         name = read_file(root / _ACTIVE, _LIMIT_BYTES).decode()
     except (OSError, UnicodeDecodeError):
@@ -127,7 +133,17 @@ def interrupted_session(root: Path) -> tuple[Path, SessionState] | None:
         return None
     folder = root / "sessions" / name
     state = read_state(folder)
-    return None if state is None or state.sealed else (folder, state)
+    if state is None or state.sealed:
+        return None
+    if state.first is None:
+        state = msgspec.structs.replace(state, first=_first_description(folder))
+    return folder, state
+
+
+def _first_description(folder: Path) -> SessionInfo | None:
+    """Read what a session began with from its first segment; None where it cannot be read."""
+    finished = segment_path(folder, 1)
+    return description_of(finished) or description_of(finished.with_name(finished.name + PART_SUFFIX))
 
 
 def list_sessions(root: Path) -> list[SessionSummary]:

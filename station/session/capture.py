@@ -42,7 +42,8 @@ async def take_pose(context: SessionContext, index: int, attempt: int, unchecked
 
     `unchecked`: an image counts, too, in which the worker failed to look for the board: solving looks again.
 
-    PoseFailedError and NotStillError when the pose failed; RobotError and RecordingError end the run.
+    PoseFailedError and NotStillError when the pose failed; RobotError and RecordingError end the run, and
+    RefusedError where arm or camera are not those the session began with.
     """
     _enter(context, index, StationState.SETTLING)
     async with ImageWatch(context, index) as watch:
@@ -50,6 +51,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int, unchecked
     _enter(context, index, StationState.CAPTURING)
     image = context.require_recording().number(await take_image(context, index))
     state, bound_s = await at_exposure(context, image)
+    context.require_same_cell()  # a device may have been exchanged while it was away
     view = View(
         index=index,
         name=context.loaded().pose(index).name,

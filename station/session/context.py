@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -131,19 +132,26 @@ class SessionContext:
             await DISK.run(recording.count_segments)
 
     def restore(self, folder: Path, state: SessionState) -> None:
-        """Show an interrupted session's poses, in state `stopped` until acknowledged. Nothing moves."""
-        if state.source != self.cell.source:
-            self.store.event(
-                "interrupted-elsewhere",
-                f"Session {folder.name} of a {state.source} cell is unfinished and cannot continue here: "
-                f"this cell is {self.cell.source}. `recordings recover {folder}` saves it.",
-                "warning",
-            )
+        """Show an interrupted session's poses, in state `stopped` until acknowledged. Nothing moves.
+
+        A session that another cell began stays as it is on the disk, and an event names both.
+        """
+        recording = SessionRecording(
+            self.root, self.cell, folder, state.parts, state.elapsed_s, state.check, state.first
+        )
+        advice = (
+            "Start the station of that cell to go on with it. "
+            f"`recordings recover {shlex.quote(str(folder))}` saves what was recorded."
+        )
+        try:
+            recording.require_same_cell(connected=False, advice=advice)
+            if state.first is None:
+                _require_same_plan(self.cell, folder, state, advice)
+        except RefusedError as elsewhere:
+            self.store.problem(elsewhere)
             return
         self.queue = PoseQueue(state.plan, state.poses)
-        self.recording = SessionRecording(
-            self.root, self.cell, folder, state.parts, state.elapsed_s, state.check
-        )
+        self.recording = recording
         reason = (
             f"The daemon ended during session {folder.name}. Saved: {self.queue.done} of "
             f"{len(self.queue.statuses)} poses. Look at the arm, acknowledge, then resume or finish."
@@ -152,6 +160,14 @@ class SessionContext:
         self.show_poses()
         self.store.update_session(elapsed_s=state.elapsed_s, check=state.check)
         self.store.event("interrupted", reason, "warning", captured=self.queue.done)
+
+    def require_same_cell(self, *, connected: bool = True) -> None:
+        """Raise RefusedError `interrupted-elsewhere` where another cell or device began the open session.
+
+        `connected`: False while devices may not have told yet who they are.
+        """
+        if self.recording is not None:
+            self.recording.require_same_cell(connected=connected)
 
     def forget_session(self, check: bool = False) -> None:
         """Clear the last session from the status when a session begins; `check`: as a drift check."""
@@ -172,6 +188,26 @@ class SessionContext:
             captured=queue.done,
             **named,
         )
+
+
+def _require_same_plan(cell: Cell, folder: Path, state: SessionState, advice: str) -> None:
+    """Compare what an older session tells of the cell that began it. RefusedError `interrupted-elsewhere`."""
+    config = cell.config
+    for what, first, now in (
+        ("source", state.source, cell.source),
+        ("mounting", state.plan.mount, config.mount),
+        ("robot", state.plan.robot, config.robot.model),
+    ):
+        if first != now:
+            raise RefusedError(
+                "interrupted-elsewhere",
+                session=folder.name,
+                what=what,
+                first=first,
+                now=now,
+                folder=folder,
+                advice=advice,
+            )
 
 
 class StatusStore:

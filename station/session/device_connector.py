@@ -7,7 +7,7 @@ import contextlib
 import logging
 from collections.abc import Awaitable, Callable
 
-from station.cell.errors import CameraError, RobotError, StationError
+from station.cell.errors import CameraError, RefusedError, RobotError, StationError
 from station.cell.status import CameraStatus, TriggerStatus
 from station.session.context import SessionContext
 
@@ -64,7 +64,14 @@ class DeviceConnector:
             self._found("trigger", identity)
 
     def _found(self, device: str, identity: str) -> None:
-        self._context.store.event("device-found", f"{device} {identity} found", device=device)
+        store = self._context.store
+        store.event("device-found", f"{device} {identity} found", device=device)
+        try:
+            self._context.require_same_cell(connected=False)
+        except RefusedError as elsewhere:  # of an interrupted session; only now the device says who it is
+            store.problem(elsewhere)
+            if store.status.cause == "interrupted":
+                store.update(reason=str(elsewhere))
 
     async def close(self) -> None:
         """Close all devices in parallel, so that a hanging camera does not delay the robot's."""

@@ -89,6 +89,7 @@ class FreedriveCapture:
         if check and context.recording is not None:
             raise RefusedError("session-open")
         await context.ready_state()
+        context.require_same_cell(connected=False)
         await look_back(context)
         Freedrive.require(store.state)  # STOP may have come in between
         context.requests.halt = False

@@ -57,7 +57,9 @@ class Motion:
 
 
 def session_motion(context: SessionContext, purpose: Purpose) -> Motion:
-    """Choose the poses that an approval for this purpose would cover. RefusedError when there are none.
+    """Choose the poses that an approval for this purpose would cover.
+
+    RefusedError when there are none, or when another cell or device began the open session.
 
     A new session gets poses of its own: until the approval the last session stays shown.
     """
@@ -70,6 +72,7 @@ def session_motion(context: SessionContext, purpose: Purpose) -> Motion:
         queue = queue.anew()
     if not queue.open:
         raise RefusedError("no-pose-left")
+    context.require_same_cell(connected=False)
     return Motion(purpose, queue, queue.open)
 
 

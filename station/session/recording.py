@@ -17,10 +17,19 @@ from recordings.errors import RecordingError
 from recordings.files import EMPTY_SUFFIX, MAIN_CAMERA, PART_SUFFIX, require_free_space
 from recordings.manifest import enter_part, read_manifest
 from recordings.recorder import Recorder
-from recordings.schema.messages import ARM_KINEMATICS_NAME, CameraModel, Image, Matrix4, SessionInfo, Stamps
+from recordings.same_session import difference
+from recordings.schema.messages import (
+    ARM_KINEMATICS_NAME,
+    CameraIdentity,
+    CameraModel,
+    Image,
+    Matrix4,
+    SessionInfo,
+    Stamps,
+)
 from recordings.software import software_versions
 from station.cell.config import matrix4
-from station.cell.errors import CameraError
+from station.cell.errors import CameraError, RefusedError
 from station.cell.layout import guess_matrix
 from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.session_folder import (
@@ -39,6 +48,7 @@ _PACKAGES = (
     "calibration-station", "numpy", "scipy", "opencv-python-headless", "mcap", "ur-rtde",
 )  # fmt: skip
 SYNC_TIMEOUT_S = 30.0
+FINISH_ADVICE = "Connect that one again, or finish the session: `station finish` keeps what was recorded."
 
 R = TypeVar("R")
 
@@ -61,6 +71,21 @@ def stamps_now() -> Stamps:
     return Stamps(time.monotonic_ns(), time.time_ns())
 
 
+def _completed(now: SessionInfo, first: SessionInfo, robot_serial: str) -> SessionInfo:
+    """Assume of devices that were not connected yet what the session began with, or what is configured."""
+    if not now.robot.serial and not now.robot.controller_version:
+        serial = robot_serial or first.robot.serial
+        now = msgspec.structs.replace(now, robot=msgspec.structs.replace(now.robot, serial=serial))
+    if not is_known(now.camera_identity):
+        now = msgspec.structs.replace(now, camera_identity=first.camera_identity)
+    return now
+
+
+def is_known(camera: CameraIdentity) -> bool:
+    """Tell whether a camera has told who it is: it tells nothing before it is opened."""
+    return bool(camera.serial) or camera.model != CameraIdentity().model
+
+
 class SessionRecording:
     """Recording of a session. Numbers its images without gaps or repeats."""
 
@@ -72,11 +97,12 @@ class SessionRecording:
         segments: int = 0,
         elapsed_s: float = 0.0,
         check: bool = False,
+        first: SessionInfo | None = None,
     ) -> None:
         """Begin a recording, or continue an interrupted one. Raises StationError.
 
-        `folder`, `segments`, `elapsed_s`: of the interrupted session; a new segment follows. `check`: it is a
-        drift check.
+        `folder`, `segments`, `elapsed_s`, `first`: of the interrupted session; a new segment follows.
+        `check`: it is a drift check.
         """
         self._root, self._cell, self._check = root, cell, check
         self.segment = segments + 1
@@ -84,6 +110,8 @@ class SessionRecording:
         self.recorder: Recorder | None = None
         self.camera: CameraModel | None = None
         """Intrinsics with which the newest file began, or only the images' size; None: none was opened."""
+        self._first = first
+        """What the session began with, to which every later segment must belong; None: nothing yet."""
         self._sequence = 0
         self._saving = asyncio.Lock()
         self._closing: threading.Thread | None = None
@@ -123,15 +151,44 @@ class SessionRecording:
         try:
             settings = await self._cell.camera.settings()
         except CameraError as error:
+            if not is_known(self._cell.camera.identity):  # nobody knows whose images would follow
+                raise
             settings = {"error": str(error)}  # taking images will report the same error
         await to_the_end(DISK.run(self._open, queue.plan, first_image, settings))
         await self.save_state(queue)
 
-    def _open(self, plan: Plan, first_image: Image | None, settings: dict[str, object]) -> None:
+    def require_same_cell(
+        self, first_image: Image | None = None, *, connected: bool = True, advice: str = FINISH_ADVICE
+    ) -> None:
+        """Raise RefusedError `interrupted-elsewhere` unless cell and devices are those of the session.
+
+        `first_image`: the lens is compared where its size or model is known. `connected`: False while devices
+        may still be unknown; what nobody told yet is not compared. `advice`: what to do about a difference.
+        """
+        first = self._first
+        if first is None:
+            return
+        now = self._cell_info(first_image)
+        if not now.camera.width:
+            now = msgspec.structs.replace(now, camera=first.camera)
+        if not connected:
+            now = _completed(now, first, self._cell.config.robot.serial)
+        if (found := difference(first, now)) is not None:
+            raise RefusedError(
+                "interrupted-elsewhere",
+                session=self.name,
+                what=found.what,
+                first=found.first,
+                now=found.other,
+                folder=self.folder,
+                advice=advice,
+            )
+
+    def _cell_info(self, first_image: Image | None) -> SessionInfo:
+        """Describe the cell and its devices as they are now."""
         config = self._cell.config
-        require_free_space(self.folder, config.capture.free_space_bytes)
         name = "" if config.camera.name == MAIN_CAMERA else config.camera.name
-        info = SessionInfo(
+        return SessionInfo(
             name=self.name,
             mount=config.mount,
             source=self._cell.source,
@@ -139,6 +196,14 @@ class SessionRecording:
             camera=self._session_camera(first_image),
             robot=self._cell.arm.identity,
             camera_identity=msgspec.structs.replace(self._cell.camera.identity, name=name),
+        )
+
+    def _open(self, plan: Plan, first_image: Image | None, settings: dict[str, object]) -> None:
+        config = self._cell.config
+        require_free_space(self.folder, config.capture.free_space_bytes)
+        self.require_same_cell(first_image)
+        info = msgspec.structs.replace(
+            self._cell_info(first_image),
             part=self.segment,
             created_wall_ns=time.time_ns(),
             plan_sha256=plan_sha256(plan),
@@ -163,6 +228,8 @@ class SessionRecording:
             raise
         self.camera = info.camera
         self.recorder = recorder
+        if self._first is None:
+            self._first = info
         camera, board = (
             None if guess is None else matrix4(guess_matrix(guess))
             for guess in (config.camera_guess, config.board_guess)
@@ -221,6 +288,7 @@ class SessionRecording:
             elapsed_s=round(self.elapsed_s, 1),
             check=self._check,
             sealed=sealed,
+            first=self._first,
         )
         async with self._saving:
             await to_the_end(DISK.run(self._write_state, state))  # complete it, so that states stay in order

@@ -63,6 +63,8 @@ class Run:
         """Start control and open the recording. False when refused: the state is as before the approval."""
         context, resting = self._context, self._context.resting
         try:
+            if self._go.motion.stop_test is None:
+                context.require_same_cell(connected=False)
             if context.recording is not None:
                 # Save the poses before anything moves, so that a restart finds them.
                 await context.recording.save_state(self._queue)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraIdentity, CameraModel
+from recordings.recover import recover_recording
+from recordings.same_session import description_of
+from recordings.schema.messages import BoardKind, BoardSpec, CameraIdentity, CameraModel, RobotIdentity
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import (
     make_image,
@@ -79,6 +81,10 @@ def test_the_same_part_twice_is_noticed(tmp_path: Path) -> None:
         {"source": "real"},
         {"camera": CameraModel(32, 24)},
         {"camera_identity": CameraIdentity(serial="4711")},
+        {"camera_identity": CameraIdentity(model="another")},
+        {"robot": RobotIdentity(serial="4711")},
+        {"robot": RobotIdentity(model="UR5")},
+        {"board": BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.030)},
     ],
 )
 def test_parts_of_different_sessions_do_not_mix(tmp_path: Path, changes: dict[str, object]) -> None:
@@ -86,3 +92,38 @@ def test_parts_of_different_sessions_do_not_mix(tmp_path: Path, changes: dict[st
     write_part(tmp_path / "session-2.mcap", [(1, 1)], part=2, **changes)
     with refused("several-sessions"):
         open_recording(tmp_path)
+
+
+def test_what_differs_between_two_parts_is_named_with_both(tmp_path: Path) -> None:
+    write_part(tmp_path / "session.mcap", [(0, 1)], robot=RobotIdentity("UR10", "1001"))
+    write_part(tmp_path / "session-2.mcap", [(1, 1)], part=2, robot=RobotIdentity("UR10", "2002"))
+    with refused("several-sessions", what="robot", first="UR10 1001", other="UR10 2002"):
+        open_recording(tmp_path)
+
+
+def test_parts_of_two_robots_are_read_again_as_the_error_tells(tmp_path: Path) -> None:
+    """Each robot's files in a folder of their own, where `recordings recover` notes what lacks."""
+    first = tmp_path / "first"
+    second = tmp_path / "second"
+    first.mkdir()
+    second.mkdir()
+    write_part(first / "session.mcap", [(0, 1)], robot=RobotIdentity("UR10", "1001"))
+    moved = write_part(first / "session-2.mcap", [(1, 1)], part=2, robot=RobotIdentity("UR10", "2002"))
+    moved.rename(second / moved.name)
+    for folder, serial in ((first, "1001"), (second, "2002")):
+        recover_recording(folder)
+        recording = open_recording(folder)
+        assert recording.info.robot.serial == serial
+        assert len(recording.views()) == 1
+
+
+def test_whose_a_file_is_says_its_beginning_before_it_is_finished(tmp_path: Path) -> None:
+    info = make_info(robot=RobotIdentity("UR10", "1001"))
+    with RecordingWriter(tmp_path / "session.mcap", info) as writer:
+        writer.flush()
+        assert description_of(writer.part_path) == info
+        path = writer.finish()
+    assert description_of(path) == info
+    path.write_bytes(path.read_bytes()[:40])
+    assert description_of(path) is None
+    assert description_of(tmp_path / "nothing.mcap") is None

@@ -15,6 +15,7 @@ from calibrate.check.history import read_checks
 from calibrate.check.production import EARLIER, NEWEST, EarlierPictures, check_production
 from calibrate.cli import main
 from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.files.calibration import read_calibration
 from calibrate.files.install import install
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState
@@ -71,7 +72,7 @@ def test_a_shift_is_noticed_within_ten_pictures_and_nothing_else(cell: ArmCell) 
 class Production:
     """A folder of pictures of one tag that a program adds to; the camera may move."""
 
-    def __init__(self, folder: Path, root: Path) -> None:
+    def __init__(self, folder: Path, root: Path, robot: dict[str, str] | None = None) -> None:
         found = load_installed(root)
         self.folder, self.lens, self.X = folder, found.intrinsics.model, found.transform.matrix
         self.rng = np.random.default_rng(7)
@@ -84,6 +85,8 @@ class Production:
             "board": {"kind": "april-tag", "square_m": 0.05, "id": 0},
             "camera": {"width": self.lens.width, "height": self.lens.height},
         }
+        if robot is not None:
+            stated["robot"] = robot
         (folder / "dataset.yaml").write_text(yaml.safe_dump(stated))
         (folder / "poses.csv").write_text("image,x,y,z,qx,qy,qz,qw\n")
 
@@ -121,3 +124,17 @@ def test_a_folder_that_grows_puts_a_moved_camera_in_doubt(root: Path, tmp_path: 
     few = Production(tmp_path / "few", root)
     few.take(4)
     assert call(main, "drift-check", few.folder, "--root", root).returncode == 1
+
+
+def test_pictures_of_another_robot_are_refused_and_both_are_named(root: Path, tmp_path: Path) -> None:
+    calibrated = read_calibration(load_installed(root).path).robot
+    assert calibrated.serial
+    others = Production(tmp_path / "others", root, {"model": calibrated.model, "serial": "4711"})
+    others.take(4)
+    refused = call(main, "drift-check", others.folder, "--root", root, "--json")
+    error = json.loads(refused.stdout)["error"]
+    assert error["code"] == "views-of-another-cell"
+    assert error["values"]["differs"] == "robot"
+    assert error["values"]["found"] == "4711"
+    assert error["values"]["calibrated"] == calibrated.serial
+    assert load_installed(root).validity.state is ValidityState.VALID

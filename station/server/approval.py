@@ -1,7 +1,8 @@
 """Permission to approve motion, decided from what the kernel tells of a client and from the configuration.
 
 What a client says of itself does not count. A person counts as present when the client is in the foreground
-of a terminal; what that proves and what it does not: docs/operator/safety.md.
+of a terminal and belongs to no system service, which could open a terminal of its own. What that proves and
+what it does not: docs/operator/safety.md.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from station.cell.config import ApprovalConfig
 from station.cell.errors import RefusedError
+from station.server.control_group import system_service
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class Process:
     """Terminal in whose foreground it is, such as 'pts/3'; empty: none."""
     parent: int = 0
     """Process that started it; that of a screen is in the person's terminal (`tui.stop_key`)."""
+    service: str = ""
+    """System service that it belongs to, such as 'calibrate@s-1.service'; empty: none, or it is not known."""
 
 
 def process(pid: int) -> Process | None:
@@ -40,7 +44,7 @@ def process(pid: int) -> Process | None:
     except (OSError, ValueError, IndexError):  # STOP never waits for a name
         return None
     shown = terminal != 0 and group == foreground
-    return Process(user, began, _terminal_name(terminal) if shown else "", parent)
+    return Process(user, began, _terminal_name(terminal) if shown else "", parent, system_service(pid))
 
 
 def _terminal_name(number: int) -> str:
@@ -96,6 +100,8 @@ class ApprovalRule:
         if terminal := self.terminal(asks):
             self._require_permitted(asks)
             return f"at {terminal}"
+        if service := self._service(asks):
+            raise RefusedError("service-terminal", what=what, service=service)
         raise RefusedError(
             "no-terminal", what=what, advice="A person must review and approve it there (docs: Safety)."
         )
@@ -107,6 +113,8 @@ class ApprovalRule:
         if self._simulated or self.terminal(asks):
             return self.by_person(asks, "A move")
         if asks.user not in self._config.services:
+            if service := self._service(asks):
+                raise RefusedError("service-terminal", what="A move", service=service)
             raise RefusedError("no-service", user=asks.user)
         if not sha256:
             raise RefusedError("no-plan-named", user=asks.user)
@@ -117,9 +125,16 @@ class ApprovalRule:
         seen = self._see(asks.pid)
         if seen is None or seen.user != asks.uid or seen.began_ticks != asks.began_ticks:
             return ""
+        if seen.service:  # a service opens terminals too, and no person sees them
+            return ""
         # A screen runs in a terminal of its own; the process that hears F12 for it is in the person's.
         outer = self._see(seen.parent) if seen.terminal else None
         return outer.terminal if outer and outer.user == asks.uid and outer.terminal else seen.terminal
+
+    def _service(self, asks: Peer) -> str:
+        """Name the system service of a client that has a terminal nobody sees; empty: it has none."""
+        seen = self._see(asks.pid)
+        return seen.service if seen is not None and seen.terminal else ""
 
     def _require_permitted(self, asks: Peer) -> None:
         if self._config.persons and asks.user not in self._config.persons:

@@ -2,6 +2,7 @@
 
 `station serve --simulate` owns its controller, which ends with it; here a test can look at the arm of a
 daemon that was killed. CELL_CONTROL: what drives the arm.
+CELL_SOURCE: `real` lets only approve whom a real arm's daemon would, of the simulated arm all the same.
 CELL_HANGS: `camera` or `disk` hangs for ever, from the second image or the first view on.
 """
 
@@ -72,7 +73,7 @@ def main() -> None:
         arm=arm,
         mover=arm,
         camera=(HangingCamera if hangs == "camera" else RenderedCamera)(truth, host, config.camera),
-        source="simulated",
+        source="real" if os.environ.get("CELL_SOURCE") == "real" else "simulated",
         attachments={"truth.json": Path(truth_file).read_bytes()},
     )
     asyncio.run(serve_cell(cell, place, Path(socket), end_with_stdin="INVOCATION_ID" not in os.environ))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -70,6 +72,74 @@ def test_users_are_creatable(scratch: Path) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stderr
+
+
+def may_stage() -> bool:
+    """Tell whether this user may give a program other accounts than this machine's."""
+    if not shutil.which("unshare") or not shutil.which("systemd-tmpfiles"):
+        return False
+    tried = subprocess.run(["unshare", "--mount", "mount", "--bind", "/etc", "/etc"], capture_output=True)
+    return tried.returncode == 0
+
+
+@pytest.mark.skipif(not may_stage(), reason="needs root, unshare and systemd-tmpfiles")
+def test_an_installation_over_an_older_one_gives_the_solver_the_sessions_that_are_there() -> None:
+    """In a staged root that holds what the older one left: sessions, all of them the daemon's."""
+    root = Path(tempfile.mkdtemp(prefix="st-"))
+    root.chmod(0o755)  # as /, through which the solver passes
+    try:
+        make("install-files", root)
+        (root / "etc/sysusers.d/station.conf").write_text("g station-operator -\nu station -\n")
+        subprocess.run(["systemd-sysusers", f"--root={root}"], check=True)
+        accounts = _accounts(root, "passwd")
+        session = root / "var/lib/station/sessions/s-1"
+        session.mkdir(parents=True)
+        recording = session / "session.mcap"
+        for file in (recording, session / "calibration.yaml"):
+            file.write_text("of before")
+            file.chmod(0o640)
+        for path in (session.parents[1], session.parent, session, *session.iterdir()):
+            os.chown(path, accounts["station"], _accounts(root, "group")["station-operator"])
+        session.chmod(0o2770)
+        make("install-files", root)
+        subprocess.run(["systemd-sysusers", f"--root={root}"], check=True)
+        # It looks names up where it runs: there the staged root's accounts take the place of this machine's.
+        lent = "".join(f"mount --bind {root}/etc/{name} /etc/{name}; " for name in ("passwd", "group"))
+        tmpfiles = f"{lent} exec systemd-tmpfiles --root={root} --create"
+        subprocess.run(["unshare", "--mount", "sh", "-ec", tmpfiles], check=True)
+        solver = _accounts(root, "passwd")["station-solver"]
+        group = _accounts(root, "group")["station-solver"]
+
+        def as_solver(command: str) -> str:
+            done = subprocess.run(
+                ["sh", "-c", command],
+                user=solver, group=group, extra_groups=[], cwd=session, capture_output=True, text=True,
+            )  # fmt: skip
+            return done.stdout if done.returncode == 0 else "refused"
+
+        assert as_solver("cat session.mcap") == "of before"
+        assert as_solver("echo new > new; mv new calibration.yaml; cat calibration.yaml") == "new\n"
+        assert as_solver("echo x >> session.mcap") == "refused"
+        assert as_solver("mkdir ../s-2") == "refused"
+        assert as_solver("mkdir ../../calibrations/x") == "refused"
+        result = (session / "calibration.yaml").stat()
+        assert result.st_gid == _accounts(root, "group")["station-operator"], "operators read it"
+    finally:
+        shutil.rmtree(root)
+
+
+def _accounts(root: Path, file: str) -> dict[str, int]:
+    """Name → number, of /etc/passwd or /etc/group of a staged root."""
+    lines = (root / "etc" / file).read_text().splitlines()
+    return {name: int(number) for name, _, number, *_ in (line.split(":") for line in lines)}
+
+
+def test_the_solver_is_in_no_group_that_may_ask_the_daemon(scratch: Path) -> None:
+    text = (scratch / "etc/systemd/system/calibrate@.service").read_text().splitlines()
+    assert "User=station-solver" in text
+    assert "Group=station-solver" in text
+    users = (scratch / "etc/sysusers.d/station.conf").read_text().splitlines()
+    assert not [line for line in users if line.startswith("m station-solver")]
 
 
 def test_uninstall_removes_all_but_what_is_the_owners(scratch: Path) -> None:

@@ -169,6 +169,11 @@ def with_none(pid: int) -> Process:
     return Process(os.getuid(), 77, "")
 
 
+def in_a_service(pid: int) -> Process:
+    """It opened the terminal itself."""
+    return Process(os.getuid(), 77, "pts/3", service="calibrate@s-1.service")
+
+
 ME = user_name(os.getuid())
 STARTS = count()
 STOP_TEST = {"way": "control", "speed_m_s": 0.05}
@@ -226,6 +231,35 @@ async def test_a_named_service_approves_by_the_hash_of_plan_and_cell_and_is_writ
     for texts in (told, recorded):
         assert len(texts) == 1 and ME in texts[0] and f"pid {os.getpid()}" in texts[0]
         assert "service" in texts[0] and sha256[:12] in texts[0]
+    await served.control.close()
+
+
+async def test_a_service_with_a_terminal_of_its_own_is_no_person(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path
+) -> None:
+    served = await real_cell(new_rig, tmp_path, in_a_service, ApprovalConfig(persons=(ME,)))
+    async with await served.client() as program:
+        summary = await offered(program, small_plan)
+        sha256 = approval_sha256(small_plan, served.rig.session.context.cell.config)
+        for named in ({}, {"approval_sha256": sha256}):
+            with raises("service-terminal", service="calibrate@s-1.service"):
+                await program.request("go", token=summary["token"], **named)
+        with raises("service-terminal"):
+            await program.request("prepare", stop_test=STOP_TEST)
+    assert "start control" not in served.rig.arm.log
+    await served.control.close()
+
+
+async def test_a_named_service_with_a_terminal_of_its_own_needs_the_hash(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path
+) -> None:
+    served = await real_cell(new_rig, tmp_path, in_a_service, ApprovalConfig(services=(ME,)))
+    async with await served.client() as program:
+        summary = await offered(program, small_plan)
+        with raises("no-plan-named"):
+            await program.request("go", token=summary["token"])
+        sha256 = approval_sha256(small_plan, served.rig.session.context.cell.config)
+        await program.request("go", token=summary["token"], approval_sha256=sha256)
     await served.control.close()
 
 

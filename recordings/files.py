@@ -7,6 +7,7 @@ import fcntl
 import os
 import re
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 from recordings.errors import RecordingError, disk_error, exists_error
@@ -137,11 +138,12 @@ def rename_new(source: Path, target: Path) -> None:
     sync_folder(target.parent)
 
 
-def write_atomically(path: Path, content: bytes, mode: int = 0o640) -> None:
+def write_atomically(path: Path, content: bytes, mode: int = 0o640, like: Path | None = None) -> None:
     """The file is the old one or the new one, never half, also when several write it or the power fails.
 
-    `mode`: its permissions, less the umask. OSError as it comes; nothing is left beside the file then. A
-    device or a pipe is never replaced.
+    `mode`: its permissions, less the umask. `like`: a file whose permissions it gets instead, and its owner
+    where that is permitted. OSError as it comes; nothing is left beside the file then. A device or a pipe is
+    never replaced.
     """
     if path.exists() and not path.is_file():
         raise OSError(errno.EEXIST, "it exists and is no file", str(path))
@@ -151,6 +153,8 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o640) -> None:
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     try:
         with os.fdopen(descriptor, "wb") as file:
+            if like is not None:
+                _make_like(descriptor, like.stat())
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -159,6 +163,12 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o640) -> None:
     except OSError:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _make_like(descriptor: int, old: os.stat_result) -> None:
+    with suppress(PermissionError):
+        os.fchown(descriptor, old.st_uid, old.st_gid)
+    os.fchmod(descriptor, stat.S_IMODE(old.st_mode))
 
 
 def require_free_space(folder: Path, reserve_bytes: int) -> int:

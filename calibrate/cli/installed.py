@@ -156,13 +156,21 @@ def rollback(
     root: Root = None,
     camera: CameraName = MAIN_CAMERA,
     reason: Annotated[str, typer.Option(help="Reason, kept in the log")] = "",
+    override: Annotated[
+        str,
+        typer.Option(
+            help="Reason to use the version although a damaged line of the log may have withdrawn it; "
+            "kept in the log"
+        ),
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Go back to an older installed calibration.
 
     The one before, or a version of `calibrate list`. It is unverified then, until a drift check passes.
     """
-    _switched(installing.rollback(root, to, reason, camera=camera), as_json)
+    made = installing.rollback(root, to, reason, camera=camera, override=override)
+    _switched(made, as_json)
 
 
 def withdraw(

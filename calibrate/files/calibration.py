@@ -17,7 +17,13 @@ from numpy.typing import ArrayLike
 
 from calibrate.arm_table import CorrectedArm, FramePose
 from calibrate.errors import CalibrationFileError
-from calibrate.files.integrity import check_result, content_sha256, read_bounded, verified_plain
+from calibrate.files.integrity import (
+    check_result,
+    content_sha256,
+    read_bounded,
+    require_content_of_name,
+    verified_plain,
+)
 from calibrate.files.touch import Touch, agrees
 from calibrate.geometry import Transform
 from calibrate.results import (
@@ -236,8 +242,14 @@ def decode_calibration(content: bytes, where: str) -> Calibration:
 
 
 def read_calibration(path: Path | str) -> Calibration:
-    """Read and verify a calibration file. Raises CalibrationFileError."""
-    return decode_calibration(read_bounded(Path(path)), str(path))
+    """Read and verify a calibration file. Raises CalibrationFileError.
+
+    An installed version must also be the one that its name says.
+    """
+    content = read_bounded(Path(path))
+    calibration = decode_calibration(content, str(path))
+    require_content_of_name(Path(path), content)
+    return calibration
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:

@@ -11,10 +11,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from calibrate.errors import InstallError
-from calibrate.files.validity import FILE, Validity, parse_validity, unrecorded
-from recordings.files import LOG_LIMIT_BYTES, MAIN_CAMERA, is_session_name, read_file, state_root
+from calibrate.files.validity import Validity
+from calibrate.files.validity_log import read_validity_log
+from recordings.files import MAIN_CAMERA, is_session_name, state_root
 
-VERSION_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
+VERSION_NAME = re.compile(r"(\d{4,})-([0-9a-f]{8})\.yaml")
+"""File of a version in `gen`: its number, and the first digits of the SHA-256 of its content."""
 
 
 def calibrations_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
@@ -55,16 +57,10 @@ def current_version(folder: Path) -> tuple[int, Path]:
     return int(match[1]), folder / "gen" / name
 
 
-def read_validity(folder: Path) -> dict[int, Validity]:
-    """Read the last validity record of each version. Raises OSError."""
-    path = folder / FILE
-    return parse_validity(read_file(path, LOG_LIMIT_BYTES)) if path.exists() else {}
-
-
 def validity_of(folder: Path, number: int) -> Validity:
     """Read the validity now of version `number`, which need not be the current one."""
     try:
-        found = read_validity(folder).get(number) or unrecorded(number)
+        found = read_validity_log(folder).of(number)
     except OSError as problem:
         raise InstallError(
             "state-folder", path=problem.filename or str(folder), why=problem.strerror

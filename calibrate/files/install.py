@@ -12,23 +12,22 @@ from typing import Literal, get_args
 import msgspec
 import numpy as np
 
-from calibrate.errors import GateFailedError, InstallError, require_choice, require_positive
+from calibrate.errors import (
+    GateFailedError,
+    InstallError,
+    UsageError,
+    require_choice,
+    require_positive,
+)
 from calibrate.files.calibration import Calibration, Override, read_calibration
 from calibrate.files.folders import (
     calibrations_folder,
     current_version,
-    read_validity,
 )
-from calibrate.files.lines import append_line
 from calibrate.files.touch import agrees, touch_text
-from calibrate.files.validity import FILE as VALIDITY_FILE
-from calibrate.files.validity import (
-    Validity,
-    ValidityReason,
-    ValidityState,
-    time_text,
-    unrecorded,
-)
+from calibrate.files.validity import LOG_DAMAGED, Validity, ValidityReason, ValidityState, time_text
+from calibrate.files.validity_log import read_validity_log
+from calibrate.files.validity_writer import append_to_log
 from calibrate.files.versions import (
     InstalledVersion,
     add_version,
@@ -37,6 +36,7 @@ from calibrate.files.versions import (
     locked,
     make_current,
     read_log,
+    version_numbers,
     who,
 )
 from calibrate.geometry import difference
@@ -143,21 +143,29 @@ def _max_age_days(folder: Path, asked: float | None) -> float | None:
     """Return the oldest age of the last proof that is allowed: `asked`, else as for the version before."""
     if asked is not None:
         return asked or None
-    recorded = read_validity(folder)
-    newest = list(recorded.values())[-1:]
-    return newest[0].max_age_days if newest else None
+    log = read_validity_log(folder)
+    return log.of(max(log.last)).max_age_days if log.last else None
 
 
 def rollback(
-    root: Path | None = None, to: int | None = None, reason: str = "", *, camera: str = MAIN_CAMERA
+    root: Path | None = None,
+    to: int | None = None,
+    reason: str = "",
+    *,
+    camera: str = MAIN_CAMERA,
+    override: str = "",
 ) -> InstalledVersion:
     """Make the calibration before the current one, or version `to`, the current one again.
 
-    It is unverified until a check passes, or in doubt if it was before. `reason`: may be empty. Raises
-    InstallError.
+    It is unverified until a check passes, or in doubt if it was before. `reason`: may be empty. `override`: a
+    person's reason why version `to` may be used although a damaged line of the log may have withdrawn it
+    (`log-damaged`); it goes into the log. Raises InstallError.
     """
-    if reason.strip():
-        _require_words(reason)
+    for given in (reason, override):
+        if given.strip():
+            _require_words(given)
+    if override.strip() and to is None:
+        raise UsageError("override-without-version")
     folder = calibrations_folder(root, camera)
     if to is None:
         current_version(folder)  # raises first, so that no folder is created in vain
@@ -176,8 +184,11 @@ def rollback(
             raise InstallError("damaged-version", generation=target.number, why=target.problem)
         before = next((g.calibration for g in known if g.current), None)
         change = change_text(before, target.calibration)
-        validity = _validity_again(target, _max_age_days(folder, None))
-        return make_current(folder, replace(target, validity=validity), "rollback", change, reason)
+        recorded = read_validity_log(folder).of(target.number)
+        was = replace(recorded, max_age_days=_max_age_days(folder, None))
+        validity = _validity_again(was, target.current, override.strip())
+        said = reason or override.strip()
+        return make_current(folder, replace(target, validity=validity), "rollback", change, said)
 
 
 def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Validity:
@@ -200,12 +211,14 @@ def _line(root: Path | None, camera: str, *words: str) -> str:
     return shlex.join(["calibrate", *words, *where, *named])
 
 
-def _validity_again(target: InstalledVersion, max_age_days: float | None) -> Validity:
+def _validity_again(was: Validity, current: bool, override: str) -> Validity:
     """Choose the validity of a version after a rollback: it was not checked while it was not current."""
-    was = replace(target.validity, max_age_days=max_age_days)
-    if was.state is ValidityState.IN_DOUBT or target.current:
+    if was.reason.code == LOG_DAMAGED and override:
+        reason = ValidityReason("override", f"In spite of a damaged log: {override}")
+    elif was.state is ValidityState.IN_DOUBT or current:
         return was
-    reason = ValidityReason("rolled-back", "Rolled back to. Run a drift check.")
+    else:
+        reason = ValidityReason("rolled-back", "Rolled back to. Run a drift check.")
     return replace(was, state=ValidityState.UNVERIFIED, since=time_text(), reason=reason, who=who())
 
 
@@ -220,12 +233,15 @@ def set_validity(
     """Record that the installed calibration of `camera` is valid, unverified, in doubt or withdrawn, and why.
 
     `version`: the one that was judged. Raises InstallError: `other-version` where another one is installed by
-    now, `nothing-installed` where none is. VALID makes now the time of the last proof.
+    now, `nothing-installed` where none is. VALID makes now the time of the last proof. A doubt by
+    `log-damaged` stays unless it is withdrawn: a person ends it with `rollback`.
     """
     require_choice("state", state, ValidityState)
     state, now = ValidityState(state), time_text()
 
     def change(before: Validity) -> Validity:
+        if before.reason.code == LOG_DAMAGED and state is not ValidityState.WITHDRAWN:
+            return before
         since = before.since if before.state is state else now
         verified = now if state is ValidityState.VALID else before.verified
         return replace(before, state=state, since=since, reason=reason, who=who(), verified=verified)
@@ -258,10 +274,10 @@ def _change_validity(
         number, _ = current_version(folder)
         if version not in (None, number):
             raise InstallError("other-version", folder=folder, version=number, judged=version)
-        before = read_validity(folder).get(number) or unrecorded(number)
+        before = read_validity_log(folder).of(number)
         after = change(before)
         if after != before:
-            append_line(folder / VALIDITY_FILE, after)
+            append_to_log(folder, after, version_numbers(folder))
     return after.at(datetime.now(UTC))
 
 

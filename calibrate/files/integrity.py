@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from calibrate.errors import CalibrationFileError
+from calibrate.files.folders import VERSION_NAME
 from calibrate.geometry import Array, is_rigid, skew
 from recordings import strict_yaml
 from recordings.files import read_beginning
@@ -29,6 +30,26 @@ def read_bounded(path: Path) -> bytes:
         return read_beginning(path, _LIMIT_BYTES + 1)
     except OSError as problem:
         raise CalibrationFileError(path=path, why=problem.strerror or str(problem)) from None
+
+
+def require_content_of_name(path: Path, content: bytes) -> None:
+    """Compare an installed version with the digits in its name, which say what was installed by its number.
+
+    Files with other names, or in other folders, may hold anything. Raises CalibrationFileError.
+    """
+    match = VERSION_NAME.fullmatch(path.name)
+    if match is None or path.parent.name != "gen":
+        return
+    digits = match[2].encode()
+    of_before = _HASH_LINE.search(content)  # earlier versions of the software took them from this line
+    if hashlib.sha256(content).hexdigest()[:8].encode() != digits and (
+        of_before is None or of_before[1] != digits
+    ):
+        why = "it is not the file that was installed by this name: another one was copied over it"
+        raise CalibrationFileError("damaged-calibration", path=path, why=why)
+
+
+_HASH_LINE = re.compile(rb"^sha256: '?([0-9a-f]{8})", re.MULTILINE)
 
 
 def verified_plain(content: bytes, where: str) -> dict[str, Any]:

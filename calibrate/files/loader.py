@@ -13,7 +13,7 @@ import numpy as np
 
 from calibrate.errors import CalibrationError, CalibrationFileError, InstallError
 from calibrate.files.folders import calibrations_folder, current_version, validity_of
-from calibrate.files.integrity import check_result, read_bounded, verified_plain
+from calibrate.files.integrity import check_result, read_bounded, require_content_of_name, verified_plain
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, require_usable, time_text
 from calibrate.geometry import Array, Transform
 from recordings.files import MAIN_CAMERA
@@ -131,7 +131,9 @@ def load_installed(
 def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
     folder = calibrations_folder(root, camera)
     number, path = current_version(folder)
-    plain = verified_plain(read_bounded(path), str(path))
+    content = read_bounded(path)
+    plain = verified_plain(content, str(path))
+    require_content_of_name(path, content)
     try:
         check_result(plain, str(path))
     except (KeyError, TypeError, ValueError) as problem:

@@ -1,14 +1,10 @@
 """Validity of an installed calibration: valid, unverified, in doubt or withdrawn; since when, and why.
 
-    …/validity.jsonl     one line for each install, check, doubt and withdrawal; a version's last line counts;
-                         a line with `switch` is also the log of an install or a rollback
-
 Needs only the standard library, because programs that use the camera load it too (`loader`).
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
@@ -16,12 +12,19 @@ from typing import Any
 
 from calibrate.errors import InstallError
 
-FILE = "validity.jsonl"
+NO_RECORD = "no-record"
+"""Code of the reason where the log has no line of a version."""
+LOG_DAMAGED = "log-damaged"
+"""Code of the reason where a damaged line of the log may have withdrawn a version."""
 LONGEST_AGE_DAYS = 36_500
 """A longer limit of the last proof's age is a slip."""
 WITHDRAWN_REMEDY = (
     "Solve a new recording and run `calibrate install FILE`, "
     "or `calibrate rollback NUMBER` to another version of `calibrate list`"
+)
+LOG_DAMAGED_REMEDY = (
+    "Ask whoever is in charge of the cell whether version {version} was withdrawn. If it was not, run "
+    '`calibrate rollback {version} --override "REASON"`. Else solve a new recording and install it'
 )
 
 
@@ -41,7 +44,7 @@ class ValidityReason:
 
     code: str
     """installed, override, imported, rolled-back, no-record, drift-check, touch-test, robot-changed,
-    camera-changed, too-old, withdrawn; more may come."""
+    camera-changed, too-old, log-damaged, withdrawn; more may come."""
     text: str = ""
     """Figures and what to do, for people."""
     values: dict[str, str | float | int | bool | None] = field(default_factory=dict)
@@ -63,22 +66,36 @@ class Validity:
     """Age of the last proof from which it is in doubt; None: no limit."""
 
     def at(self, now: datetime) -> Validity:
-        """Return the validity at a time: in doubt once the last proof is older than `max_age_days`."""
-        proven = self._proven(now)
+        """Return the validity at a time: in doubt once the last proof is older than `max_age_days`.
+
+        A last proof in the future, or at an unknown time, counts as too old.
+        """
         said_already = self.state in (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN)
-        if self.max_age_days is None or proven is None or said_already:
+        if self.max_age_days is None or said_already:
             return self
+        proven = self._proven(now)
+        if proven is None:
+            dated = parse_time(self.verified)
+            text = "The time of the last proof is not known"
+            if dated is not None:
+                text = (
+                    f"The last proof is dated {_shown(self.verified)}, which is yet to come; check the clock"
+                )
+            return self._too_old(text, None, "")
         age_days = (now - proven) / timedelta(days=1)
-        if not age_days > self.max_age_days:
+        if age_days <= self.max_age_days:
             return self
-        due = proven + timedelta(days=self.max_age_days)
-        text = f"The last proof is {age_days:.1f} days old (limit {self.max_age_days:g}). Run a drift check."
-        limits: dict[str, str | float | int | bool | None] = {
-            "age_days": round(age_days, 3),
+        due = time_text(proven + timedelta(days=self.max_age_days))
+        return self._too_old(f"The last proof is {age_days:.1f} days old", round(age_days, 3), due)
+
+    def _too_old(self, text: str, age_days: float | None, since: str) -> Validity:
+        said = f"{text} (limit {self.max_age_days:g} days). Run a drift check."
+        values: dict[str, str | float | int | bool | None] = {
+            "age_days": age_days,
             "limit_days": self.max_age_days,
         }
-        reason = ValidityReason("too-old", text, limits)
-        return replace(self, state=ValidityState.IN_DOUBT, since=time_text(due), reason=reason)
+        reason = ValidityReason("too-old", said, values)
+        return replace(self, state=ValidityState.IN_DOUBT, since=since, reason=reason)
 
     def after_check(
         self, reason: ValidityReason, passed: bool, proves: bool, when: datetime, who: str
@@ -88,10 +105,11 @@ class Validity:
         `proves`: a pass had enough power, or a failure could tell a camera's shift from other errors. Then a
         failure puts it in doubt and a pass makes it valid. Otherwise a failure makes it unverified, unless it
         is in doubt already. A pass then ends a doubt of the same kind of check; any other doubt becomes
-        unverified. Views from before the last proof change nothing. No check restores a withdrawn version.
+        unverified. Views from before the last proof change nothing. No check restores a version that was
+        withdrawn, or that a damaged line of the log may have withdrawn.
         """
         proven = self._proven(datetime.now(UTC))
-        if self.state is ValidityState.WITHDRAWN or (proven is not None and when < proven):
+        if self.for_a_person or (proven is not None and when < proven):
             return self
         doubted = self.state is ValidityState.IN_DOUBT
         changed = replace(self, reason=reason, who=who)
@@ -106,10 +124,18 @@ class Validity:
         return replace(changed, state=ValidityState.UNVERIFIED) if doubted else self
 
     @property
+    def for_a_person(self) -> bool:
+        """Tell whether only a person brings it back, no check: it was withdrawn, or may have been."""
+        return self.state is ValidityState.WITHDRAWN or self.reason.code == LOG_DAMAGED
+
+    @property
     def remedy(self) -> str:
         """What makes it usable again; one that is valid needs nothing of it."""
-        withdrawn = self.state is ValidityState.WITHDRAWN
-        return WITHDRAWN_REMEDY if withdrawn else "Run `station drift-check`, or calibrate again"
+        if self.state is ValidityState.WITHDRAWN:
+            return WITHDRAWN_REMEDY
+        if self.reason.code == LOG_DAMAGED:
+            return LOG_DAMAGED_REMEDY.format(version=self.version)
+        return "Run `station drift-check`, or calibrate again"
 
     def _proven(self, now: datetime) -> datetime | None:
         """Time of the last proof; None where it is unknown, as with a clock that was ahead."""
@@ -157,36 +183,35 @@ def validity_text(validity: Validity) -> str:
     return f"{words} since {_shown(validity.since)}{by}{why}"
 
 
-def parse_validity(content: bytes) -> dict[int, Validity]:
-    """Parse the last record of each version; `Validity.at` gives its state now.
+def parse_validity(plain: dict[str, Any]) -> Validity | None:
+    """Parse what a line of the log says of its version. None for another shape.
 
-    Torn lines and lines of another shape are skipped; of a line, what a later version adds.
+    What a later version of the software adds is left out. `Validity.at` gives the state now.
     """
-    return {entry.version: entry for line in content.splitlines() if (entry := _parse(line)) is not None}
+    try:
+        reason = ValidityReason(**_chosen(plain["reason"], _REASON_KEYS))
+        named = {"state": ValidityState(plain["state"]), "reason": reason}
+        found = Validity(**_chosen(plain, _VALIDITY_KEYS) | named)
+        texts = found.since, found.who, found.verified, reason.code, reason.text
+        shaped = type(found.version) is int and isinstance(reason.values, dict)
+        shaped = shaped and all(isinstance(text, str) for text in texts)
+        return found if shaped and (found.max_age_days is None or found.max_age_days >= 0) else None
+    except (ValueError, TypeError, KeyError):
+        return None
 
 
 def unrecorded(version: int) -> Validity:
     """Make the validity of a version of which the file has no whole line."""
     text = "Its record is lost. Run a drift check."
-    return Validity(version, ValidityState.UNVERIFIED, "", ValidityReason("no-record", text))
+    return Validity(version, ValidityState.UNVERIFIED, "", ValidityReason(NO_RECORD, text))
 
 
-def _parse(line: bytes) -> Validity | None:
-    try:
-        plain = json.loads(line)
-        reason = ValidityReason(**_known(ValidityReason, plain["reason"]))
-        named = {"state": ValidityState(plain["state"]), "reason": reason}
-        found = Validity(**_known(Validity, plain) | named)
-        texts = found.since, found.who, found.verified, reason.code, reason.text
-        shaped = type(found.version) is int and isinstance(reason.values, dict)
-        shaped = shaped and all(isinstance(text, str) for text in texts)
-        return found if shaped and (found.max_age_days is None or found.max_age_days >= 0) else None
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return None
+_VALIDITY_KEYS = [known.name for known in fields(Validity)]
+_REASON_KEYS = [known.name for known in fields(ValidityReason)]
 
 
-def _known(kind: type[Validity | ValidityReason], plain: dict[str, Any]) -> dict[str, Any]:
-    return {known.name: plain[known.name] for known in fields(kind) if known.name in plain}
+def _chosen(plain: dict[str, Any], keys: list[str]) -> dict[str, Any]:
+    return {key: plain[key] for key in keys if key in plain}
 
 
 def time_text(when: datetime | None = None) -> str:

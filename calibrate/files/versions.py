@@ -37,13 +37,13 @@ from calibrate.files.folders import (
     VERSION_NAME,
     calibrations_folder,
     current_name,
-    read_validity,
 )
 from calibrate.files.integrity import read_bounded
-from calibrate.files.lines import append_line, read_lines, share
+from calibrate.files.lines import share
 from calibrate.files.touch import LIMIT_SIGMAS, Touch, agrees, touch_sigmas, touch_text
-from calibrate.files.validity import FILE as VALIDITY_FILE
-from calibrate.files.validity import Validity, ValidityReason, ValidityState, time_text, unrecorded
+from calibrate.files.validity import Validity, ValidityReason, ValidityState, time_text
+from calibrate.files.validity_log import log_lines, read_validity_log
+from calibrate.files.validity_writer import append_to_log
 from recordings.files import MAIN_CAMERA, open_regular, sync_folder, write_atomically
 from recordings.plain_text import plain_text
 
@@ -78,19 +78,13 @@ class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     """Version that was current before, 0 where there was none; None in older logs."""
 
 
-class _Line(msgspec.Struct):
-    """What the log reads of a line in the file of validities."""
-
-    switch: LogEntry | None = None
-
-
 def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[InstalledVersion]:
     """List everything ever installed, oldest first; damaged files are listed with their problem.
 
     InstallError where the folder is not readable.
     """
     folder = calibrations_folder(root, camera)
-    current, recorded, now = current_name(folder), read_validity(folder), datetime.now(UTC)
+    current, recorded, now = current_name(folder), read_validity_log(folder), datetime.now(UTC)
     found = []
     for path in sorted((folder / "gen").glob("*.yaml")):
         match = VERSION_NAME.fullmatch(path.name)
@@ -102,7 +96,7 @@ def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> l
         except CalibrationFileError as damage:
             problem = str(damage)
         number, is_current = int(match[1]), path.name == current
-        validity = recorded.get(number) or unrecorded(number)
+        validity = recorded.of(number)
         validity = validity.at(now) if is_current else validity
         found.append(InstalledVersion(number, path, is_current, calibration, validity, problem))
     return sorted(found, key=lambda version: version.number)
@@ -145,7 +139,11 @@ def read_log(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[LogEnt
     """
     folder = calibrations_folder(root, camera)
     current = _current_number(folder)
-    entries = [line.switch for line in read_lines(folder / VALIDITY_FILE, _Line) if line.switch is not None]
+    entries = []
+    for line in log_lines(folder):
+        with suppress(msgspec.ValidationError):
+            if line.plain is not None and "switch" in line.plain:
+                entries.append(msgspec.convert(line.plain["switch"], LogEntry))
     current_after = [*(entry.replaced for entry in entries[1:]), current]
     pairs = zip(entries, current_after, strict=False)
     return [entry for entry, number in pairs if number in (entry.generation, None)]
@@ -159,8 +157,7 @@ def add_version(
     The file is durable and read back before `current` points to it. InstallError, CalibrationFileError.
     """
     content = encode_calibration(calibration)
-    numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
-    number = max(numbers, default=0) + 1
+    number = max(version_numbers(folder), default=0) + 1
     path = folder / "gen" / f"{number:04d}-{hashlib.sha256(content).hexdigest()[:8]}.yaml"
     try:
         write_atomically(path, content)
@@ -174,13 +171,19 @@ def add_version(
         raise
 
 
+def version_numbers(folder: Path) -> list[int]:
+    """Return the numbers of all versions of which there is a file. Raises OSError."""
+    names = [path.name for path in (folder / "gen").iterdir()]
+    return [int(match[1]) for name in names if (match := VERSION_NAME.fullmatch(name))]
+
+
 def make_current(
     folder: Path, version: InstalledVersion, action: Action, change: str, reason: str = ""
 ) -> InstalledVersion:
     """Switch to a version and log it. Call inside `locked` only. InstallError where it reads back wrong."""
     entry = LogEntry(time_text(), action, version.number, who(), change, reason, _current_number(folder))
     line = asdict(version.validity) | {"switch": entry}
-    append_line(folder / VALIDITY_FILE, line)  # before the switch, so that it is never missing
+    append_to_log(folder, line, version_numbers(folder))  # before the switch, so that it is never missing
     _switch(folder, version.path.name, read_bounded(version.path))
     return replace(version, current=True, change=change)
 
@@ -273,7 +276,7 @@ def note_installed(
             return None
         calibration = _with_touches(current.calibration, touches)
         found = "; ".join(touch_text(touch) for touch in touches)
-        before = read_validity(folder).get(current.number) or unrecorded(current.number)
+        before = read_validity_log(folder).of(current.number)
         worst = max(map(touch_sigmas, touches), default=0.0)
         reason = ValidityReason(
             "touch-test",

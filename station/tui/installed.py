@@ -13,8 +13,8 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, Override, Verdict, read_calibration
 from calibrate.files.folders import calibrations_folder, current_version, validity_of
 from calibrate.files.install import objections_beside
-from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState, parse_time
+from calibrate.files.validity_log import FILE as VALIDITY_FILE
 from calibrate.files.versions import LogEntry, read_log, same_solve
 from recordings.files import MAIN_CAMERA
 from station.cell.session_folder import CALIBRATION_FILE, SessionSummary, list_sessions

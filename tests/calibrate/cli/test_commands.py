@@ -17,7 +17,7 @@ import pytest
 from calibrate import load_installed
 from calibrate.check.history import append_check, read_checks
 from calibrate.errors import InstallError
-from calibrate.files import lines
+from calibrate.files import lines, validity_writer
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
 from calibrate.files.touch import Touch
@@ -182,7 +182,8 @@ def test_a_check_is_told_though_it_cannot_be_noted(
             raise OSError(28, "No space left on device")
         return write(path, flags)
 
-    monkeypatch.setattr(lines, "open_regular", full)
+    for module in (lines, validity_writer):
+        monkeypatch.setattr(module, "open_regular", full)
     done = run("drift-check", real_session_file, "--root", root, "--json", cwd=tmp_path)
     answer = json.loads(done.stdout)
     assert (done.returncode, answer["passed"]) == (4, False) and "No space left" in done.stderr

@@ -20,6 +20,7 @@ from calibrate.files.calibration import read_calibration
 from calibrate.files.folders import cameras
 from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
 from calibrate.files.integrity import canonical_json
+from calibrate.files.sealed_lines import seal
 from calibrate.files.touch import Touch, agrees, touch_sigmas
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
 from calibrate.files.versions import installed_versions, note_in_file, note_installed, read_log
@@ -93,13 +94,16 @@ def test_a_failed_check_counts_though_the_clock_was_ahead_before(make_file: Make
         ('"version":1,"since":"","verified":"","told_by":"a later version"', True),
     ],
 )
-def test_a_line_of_another_shape_is_skipped_and_what_a_later_version_adds_to_one_is_ignored(
+def test_a_line_of_another_shape_is_damage_and_what_a_later_version_adds_to_one_is_ignored(
     root: Path, line: str, kept: bool
 ) -> None:
-    with (root / "calibrations/validity.jsonl").open("a") as file:
-        file.write('{"state":"withdrawn","reason":{"code":"withdrawn"},' + line + "}\n")
-        file.write("[" * 100_000 + "\n")
-    assert load_installed(root, require_valid=False).validity.state is (W if kept else V)
+    with (root / "calibrations/validity.jsonl").open("ab") as file:
+        file.write(
+            seal(('{"state":"withdrawn","reason":{"code":"withdrawn"},' + line + "}").encode()) + b"\n"
+        )
+        file.write(b"[" * 100_000 + b"\n")
+    held = load_installed(root, require_valid=False).validity
+    assert (held.state, held.reason.code) == ((W, "withdrawn") if kept else (D, "log-damaged"))
     assert validity_text(installed_versions(root)[0].validity)
 
 

@@ -15,13 +15,12 @@ from calibrate.errors import CalibrationFileError, InstallError
 from calibrate.files import versions as module
 from calibrate.files.calibration import read_calibration
 from calibrate.files.install import change_text, install, installed_calibration, rollback
-from calibrate.files.lines import append_line
 from calibrate.files.versions import installed_versions, read_log
 from calibrate.job import SolvedRecording
 from recordings.files import write_atomically
 from tests.calibrate.sessions import shifted
 from tests.codes import raises
-from tests.durability import disk_order
+from tests.durability import disk_order, full
 
 
 def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(
@@ -37,6 +36,7 @@ def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(
         f"rename {temporary} {made}",
         "sync gen",
         "sync validity.jsonl",
+        "sync calibrations",
         "rename current.new current",
         "sync calibrations",
     ]
@@ -94,15 +94,16 @@ def test_a_full_disk_says_what_is_installed_now(
     """Once the link is there, the switch has been made."""
     install(make_file(0.0), tmp_path / "root")
 
-    def full(path: Path, content: object) -> None:
+    def refused(path: Path, *content: bytes) -> None:
         if path.name.startswith(fails):
-            raise OSError(28, "No space left on device")
-        if path.suffix:
-            (append_line if path.suffix == ".jsonl" else write_atomically)(path, content)
+            full()
+        if content:
+            write_atomically(path, *content)
 
-    for name in ("write_atomically", "append_line"):
-        monkeypatch.setattr(f"calibrate.files.versions.{name}", full)
-    monkeypatch.setattr("calibrate.files.versions.sync_folder", lambda path: full(path, b""))
+    if fails == "validity.jsonl":
+        monkeypatch.setattr("calibrate.files.versions.append_to_log", full)
+    monkeypatch.setattr("calibrate.files.versions.write_atomically", refused)
+    monkeypatch.setattr("calibrate.files.versions.sync_folder", refused)
     with raises("install-io", InstallError, switched=switched):
         install(make_file(1e-4), tmp_path / "root")
     known = installed_versions(tmp_path / "root")

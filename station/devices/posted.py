@@ -49,6 +49,11 @@ STATES_KEPT = 20_000
 """Most states kept, however many poses with times within `HISTORY_S` are posted."""
 PROGRAMS = 8
 """Most programs connected at once to the socket, and as many to the port. Only the first may post."""
+STRANGERS = 64
+"""Most connections to the port that have not shown the token yet. The oldest makes room for one more."""
+ACCEPTED_AT_ONCE = 8
+"""Connections to the port that are let in between two looks at what came. So few that a program's token,
+which it sends at once, is read long before `STRANGERS` others came after it."""
 FIRST_LINE_S = 3.0
 """Longest wait for a program's first line."""
 AFTER_WRONG_S = 1.0
@@ -81,6 +86,8 @@ class PostedArm:
         self._servers = list[asyncio.Server]()
         self._links: dict[asyncio.StreamWriter, asyncio.Task[None]] = {}
         """Connected programs, and what serves each."""
+        self._strangers: dict[asyncio.StreamWriter, None] = {}
+        """Those of them that have not shown the token of the port yet, the oldest first."""
         self._poster = ""
         """The program that has the arm; empty: none."""
         self._delay_s = 0.0
@@ -176,7 +183,11 @@ class PostedArm:
         try:
             write_atomically(self.token_file, token + b"\n", 0o600)
             return await asyncio.start_server(
-                partial(self._serve, token=token), "127.0.0.1", port, limit=READ_BYTES
+                partial(self._serve, token=token),
+                "127.0.0.1",
+                port,
+                limit=READ_BYTES,
+                backlog=ACCEPTED_AT_ONCE,
             )
         except OSError as error:
             raise StationError("socket", path=f"127.0.0.1:{port}", reason=str(error)) from None
@@ -189,11 +200,12 @@ class PostedArm:
         if (serving := asyncio.current_task()) is not None:
             self._links[writer] = serving
         try:
-            # Socket and port each have this limit, or strangers at the port would keep programs out.
-            if sum(one.get_extra_info("socket").family == family for one in self._links) > PROGRAMS:
+            if token:
+                await self._require_token(reader, writer, token)
+            # Socket and port each have this limit. Who may not post has no place in it.
+            known = [one for one in self._links if one not in self._strangers]
+            if sum(one.get_extra_info("socket").family == family for one in known) > PROGRAMS:
                 raise RobotError("post-refused", poster=poster, reason=f"{PROGRAMS} programs are connected")
-            if token and not await _gives(token, reader):
-                raise RobotError("post-token", file=self.token_file)
             if self._poster:
                 raise RobotError("post-refused", poster=poster, reason=f"{self._poster} has the arm")
             self._poster, holds = poster, True
@@ -210,7 +222,21 @@ class PostedArm:
                 self._poster = ""
                 self._forget()
             self._links.pop(writer, None)
+            self._strangers.pop(writer, None)
             writer.close()
+
+    async def _require_token(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, token: bytes
+    ) -> None:
+        """Wait for the token, as one of few strangers. RobotError where another line or none comes."""
+        self._strangers[writer] = None
+        if len(self._strangers) > STRANGERS:
+            oldest = next(iter(self._strangers))
+            del self._strangers[oldest]
+            oldest.transport.abort()
+        if not await _gives(token, reader):
+            raise RobotError("post-token", file=self.token_file)
+        self._strangers.pop(writer, None)
 
     async def _take(self, reader: asyncio.StreamReader) -> None:
         """Take a program's lines until it ends. RobotError where it is none for this cell."""
@@ -299,7 +325,7 @@ async def _gives(token: bytes, reader: asyncio.StreamReader) -> bool:
     """Tell whether a program's first line is the token."""
     try:
         first = await asyncio.wait_for(reader.readline(), FIRST_LINE_S)
-    except (TimeoutError, ValueError):  # ValueError: a line that never ends
+    except (TimeoutError, ValueError, OSError):  # ValueError: a line that never ends; OSError: it is gone
         return False
     return secrets.compare_digest(first.strip(), token)
 

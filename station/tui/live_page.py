@@ -7,6 +7,7 @@ screen published last. There is no verb, no form and no other method than GET.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hmac
 import os
 import secrets
@@ -34,11 +35,14 @@ LOOPBACK = "127.0.0.1"
 SIDE_PX = 1024
 """Pixels to ask for on either side: the most that the daemon sends."""
 BROWSERS = 8
-"""Connections at a time, each a thread; more are closed unread."""
+"""Connections at a time, each a thread. The oldest that has not shown the token makes room for one more.
+Where all have shown it, one more is closed unread."""
 BREATH_S = 0.02
 """Rest after a connection too many, and before an answer to a stranger: a flood costs STOP no time."""
 STALLED_S = 5.0
-"""A reader that takes longer for one answer, or says nothing for so long, is let go."""
+"""A reader that takes longer for a whole request or a whole answer is let go, however often a byte comes."""
+ROOM_S = 0.1
+"""Longest wait for the place of one that makes room."""
 NEWS_S = 1.0
 """An answer waits so long for a newer picture, so nobody can ask more often than pictures come."""
 WATCHED_S = 3.0
@@ -92,6 +96,8 @@ class LivePage(socketserver.ThreadingTCPServer):
     def __init__(self) -> None:
         super().__init__((LOOPBACK, 0), _Reader)
         self.places = threading.BoundedSemaphore(BROWSERS)
+        self.readers: dict[_Reader, None] = {}
+        """Open connections, the oldest first."""
         self._news = threading.Condition()
         self._body, self._asked_s = b"{}", -WATCHED_S
         self._door: Path | None = None
@@ -147,9 +153,23 @@ class LivePage(socketserver.ThreadingTCPServer):
     def process_request(self, request: socket.socket | tuple[bytes, socket.socket], address: object) -> None:
         if self.places.acquire(blocking=False):
             super().process_request(request, address)
+            return
+        stranger = next((reader for reader in [*self.readers] if not reader.proved), None)
+        if stranger is not None:
+            stranger.hang_up()
+        if stranger is not None and self.places.acquire(timeout=ROOM_S):
+            super().process_request(request, address)
         else:
             self.shutdown_request(request)
-            time.sleep(BREATH_S)
+        time.sleep(BREATH_S)
+
+    def service_actions(self) -> None:
+        """Let those go who take too long for a request; called by `serve_forever` again and again."""
+        now_s = time.monotonic()
+        for reader in [*self.readers]:
+            since_s = reader.reads_since_s
+            if since_s is not None and now_s - since_s > STALLED_S:
+                reader.hang_up()
 
     def process_request_thread(
         self, request: socket.socket | tuple[bytes, socket.socket], address: object
@@ -187,10 +207,35 @@ class _Reader(BaseHTTPRequestHandler):
     """One browser's connection: the page, and with the token the news."""
 
     server: LivePage
-    protocol_version, timeout = "HTTP/1.1", STALLED_S
+    protocol_version = "HTTP/1.1"
+    timeout = STALLED_S
+    """Of one piece that is read, and of a whole answer that is written (`socket.sendall`)."""
+    reads_since_s: float | None = None
+    """When it began to read a request; None: it has read it and answers."""
+    proved = False
+    """It has shown the token once."""
+
+    def setup(self) -> None:
+        super().setup()
+        self.server.readers[self] = None
+
+    def finish(self) -> None:
+        self.server.readers.pop(self, None)
+        super().finish()
+
+    def handle_one_request(self) -> None:
+        self.reads_since_s = time.monotonic()
+        super().handle_one_request()
+
+    def hang_up(self) -> None:
+        """End the connection from another thread: its own wakes and ends."""
+        with contextlib.suppress(OSError):  # it ended by itself
+            self.connection.shutdown(socket.SHUT_RDWR)
 
     def do_GET(self) -> None:
-        page, told = self.server, self.headers.get("Authorization", "")
+        self.reads_since_s = None
+        page = self.server
+        told = self.headers.get("Authorization", "")
         own = [f"{host}:{page.port}" for host in (LOOPBACK, "localhost")]
         origin = self.headers.get("Origin")
         # Another site's page may make a browser ask here, under a name of its own for this address.
@@ -199,6 +244,7 @@ class _Reader(BaseHTTPRequestHandler):
         elif self.path == "/":
             self._answer("text/html; charset=utf-8", PAGE)
         elif self.path == "/news" and hmac.compare_digest(told.encode(), page.password.encode()):
+            self.proved = True
             self._answer("application/json", page.newest())
         else:
             self._refuse(403 if self.path == "/news" else 404)

@@ -19,7 +19,9 @@ import msgspec
 import pytest
 
 from station.cell.status import GuidanceStatus, StationState
+from station.tui import live_page
 from station.tui.live_page import BROWSERS, LivePage
+from tests.patience import PATIENCE_S, wait_until
 from tests.tui.conftest import FakeLink, idle, in_session, opened, said, until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -123,6 +125,57 @@ async def test_slow_readers_and_a_thousand_requests_reach_neither_the_daemon_nor
         for reader in slow:
             reader.close()
         await until(pilot, lambda: page.places._value)  # and then another is served
+
+
+def dripping(page: LivePage) -> socket.socket:
+    """A connection whose request never becomes whole."""
+    link = socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S)
+    link.sendall(b"GET /news HTTP/1.1\r\nX: ")
+    return link
+
+
+def test_strangers_that_drip_do_not_shut_the_page(page: LivePage) -> None:
+    drops = [dripping(page) for _ in range(BROWSERS)]
+    wait_until(lambda: len(page.readers) == BROWSERS)
+    assert answer(page)[0] == 200
+    for link in drops:
+        link.close()
+
+
+def test_who_has_shown_the_token_makes_no_room_for_strangers(page: LivePage) -> None:
+    host, token = page.address[len("http://") :].split("/#")
+    asked = f"GET /news HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
+    with socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S) as browser:
+        browser.sendall(asked)
+        assert browser.recv(12) == b"HTTP/1.1 200"
+        drops = [dripping(page) for _ in range(3 * BROWSERS)]
+        wait_until(lambda: len(page.readers) == BROWSERS)
+        browser.sendall(asked)
+        assert browser.recv(12), "it is still served"
+        for link in drops:
+            link.close()
+
+
+def test_a_request_has_an_end_as_a_whole(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_page, "STALLED_S", 0.3)
+    link = dripping(page)
+    link.settimeout(0.05)
+    closed = False
+
+    def ended() -> bool:
+        nonlocal closed
+        try:
+            link.sendall(b"x")
+            closed = closed or link.recv(1000) == b""
+        except TimeoutError:
+            return False
+        except OSError:
+            closed = True
+        return closed
+
+    wait_until(ended)
+    link.close()
+    assert answer(page)[0] == 200
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")

@@ -262,13 +262,35 @@ async def test_programs_that_give_no_token_do_not_pile_up_nor_keep_others_out(
 ) -> None:
     monkeypatch.setattr(posted, "FIRST_LINE_S", PATIENCE_S)
     door = ("127.0.0.1", arm._tcp_port)
-    *_others, last = [Poster(*await asyncio.open_connection(*door)) for _ in range(posted.PROGRAMS + 1)]
-    assert await last.refused() == "post-refused"
-    await (await Poster.at(arm)).rest(3)
+    strangers = [Poster(*await asyncio.open_connection(*door)) for _ in range(posted.STRANGERS)]
+    poster = Poster(*await asyncio.open_connection(*door))
+    with contextlib.suppress(OSError):  # reset
+        await strangers[0].reader.read()  # the oldest made room
+    poster.say(arm.token_file.read_bytes())
+    poster.say(LIVE)
+    await poster.rest(3)
     await until(lambda: trouble(arm) == "")
     arm.notice = ""
-    assert await Poster(*await asyncio.open_connection(*door)).refused() == "post-refused"
+    strangers += [Poster(*await asyncio.open_connection(*door)) for _ in range(2 * posted.STRANGERS)]
+    for oldest in strangers[: -posted.STRANGERS]:
+        with contextlib.suppress(OSError):  # reset
+            await oldest.reader.read()
+    poster.post(step_s=0.1)
+    await until(lambda: trouble(arm) == "")
     assert not arm.notice, "strangers say nothing on the screen where a program has the arm"
+
+
+async def test_a_stranger_that_writes_slowly_is_let_go(
+    arm: PostedArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(posted, "FIRST_LINE_S", 0.3)
+    stranger = Poster(*await asyncio.open_connection("127.0.0.1", arm._tcp_port))
+    async with asyncio.timeout(PATIENCE_S):
+        while not stranger.reader.at_eof():
+            with contextlib.suppress(OSError):
+                stranger.say(b"0")
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stranger.reader.read(1000), 0.05)
 
 
 async def test_a_port_that_another_program_has_is_named_at_every_attempt(tmp_path: Path) -> None:

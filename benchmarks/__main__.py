@@ -33,6 +33,7 @@ SHOWN: dict[str, str] = {
     "mistakes": r"^\*\*",
     "misread_poses": r"^\*\*",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
+    "library_cpu": r"^\| 25",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
     "by_hand": r"^\| (all|ur)",
     "drift": r"^\| (ur|seven joints) ",

@@ -18,6 +18,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from calibrate.blas_threads import one_blas_thread
 from calibrate.boards.model import check_board
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError, require_choice
@@ -111,6 +112,7 @@ def single_threaded_opencv() -> Iterator[None]:
 
 
 @single_threaded_opencv()
+@one_blas_thread()
 def prepare_views(
     path: Path,
     options: JobOptions | None = None,
@@ -167,6 +169,7 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
 
 
 @single_threaded_opencv()
+@one_blas_thread()
 def solve_recording(
     path: Path,
     options: JobOptions | None = None,

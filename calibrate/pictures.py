@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calibrate.blas_threads import one_blas_thread
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points, check_board, typed_board
 from calibrate.errors import BadViewsError, TooFewViewsError
@@ -43,6 +44,7 @@ class SolvedPictures(Solved):
     """Number of a picture without the board → reason."""
 
 
+@one_blas_thread()
 def read_folder(
     folder: Path | str,
     board: BoardSpec | str | None = None,
@@ -115,6 +117,7 @@ def _seen(given: ArrayLike | None, board: BoardSpec) -> _Seen:
 
 
 @single_threaded_opencv()
+@one_blas_thread()
 def solve(
     images: Sequence[ArrayLike | None],
     poses: ArrayLike,

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calibrate.blas_threads import one_blas_thread
 from calibrate.geometry import Array
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
@@ -35,6 +36,7 @@ _POSE_PRECISION = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 USUAL_NOISE = MeasurementNoise()
 
 
+@one_blas_thread()
 def view_information(
     mount: Mount,
     camera: CameraModel,
@@ -78,6 +80,7 @@ def view_information(
     return np.asarray(information)
 
 
+@one_blas_thread()
 def prior_information(
     camera: CameraModel,
     lens_known: bool,
@@ -98,6 +101,7 @@ def prior_information(
     return N
 
 
+@one_blas_thread()
 def covariance_of(information: Array, prior: Array | None = None) -> Array:
     """Invert information (..., p, p) to covariance, scaled so that metres and pixels do not clash.
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from scipy import optimize
 
+from calibrate.blas_threads import one_blas_thread
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, is_rigid, perturb, rotation_log
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses
@@ -55,6 +56,7 @@ _EXACT = 1e-6
 """1σ of robot poses, lens and board that are taken as exact: metres and radians, or relative."""
 
 
+@one_blas_thread()
 def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[PeerResult]:
     """Run every method, ours last. All get the views that ours keeps (turned boards set right), with the
     board poses of the given intrinsics; e_t and e_R are scored on the last 6 of them, fitted without.

@@ -24,6 +24,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
+from calibrate.blas_threads import one_blas_thread
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, Transform, skew
 from calibrate.handeye.arm import FLEX
@@ -87,6 +88,7 @@ _FREE_FOCAL = 0.02
 """Relative 1σ, for other readings, of a focal length that was estimated from the same images."""
 
 
+@one_blas_thread()
 def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution:
     """Calibrate from views that have `camera_from_board` (run PnP first).
 

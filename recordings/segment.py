@@ -14,7 +14,8 @@ from mcap.records import Attachment, Message
 
 from recordings.errors import BadImageError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name, open_file
-from recordings.images import ImageError, Pixels, decode_image, raw_array
+from recordings.image_headers import ImageError
+from recordings.images import Pixels, decode_image, raw_array
 from recordings.manifest import PARTS_LIMIT
 from recordings.mcap.contents import MessageIndex
 from recordings.mcap.records import BadRecordError, require_crc

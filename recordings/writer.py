@@ -18,7 +18,7 @@ import msgspec
 
 from recordings.errors import RecordingError, disk_error, exists_error, recover_line, wrong_size_error
 from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
-from recordings.images import ImageError, read_header
+from recordings.image_headers import ImageError, read_header
 from recordings.mcap.output import OutputFile
 from recordings.mcap.records import with_crc
 from recordings.schema import viewing

@@ -27,7 +27,8 @@ from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.views import NO_CORNERS, BoardView, ViewSet
 from recordings.errors import ImportSourceError
 from recordings.files import read_file
-from recordings.images import IMAGE_LIMIT_BYTES, ImageError, decode_image, read_header
+from recordings.image_headers import IMAGE_LIMIT_BYTES, ImageError, read_header
+from recordings.images import decode_image
 from recordings.importers.conventions import Convention, possible
 from recordings.importers.messages import Progress
 from recordings.importers.tables import Contents, Table

@@ -15,16 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError, wrong_size_error
-from recordings.images import (
-    KEPT_FORMATS,
-    ImageError,
-    Pixels,
-    decode_image,
-    encode_png,
-    pixel_format_of,
-    raw_array,
-    read_header,
-)
+from recordings.image_headers import KEPT_FORMATS, ImageError, read_header
+from recordings.images import Pixels, decode_image, encode_png, pixel_format_of, raw_array
 from recordings.importers.bags import open_bag
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
 from recordings.importers.folder import Imported

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from recordings import strict_yaml
 from recordings.errors import ImportSourceError, disk_error
 from recordings.files import read_file, session_name_from
-from recordings.images import SIDE_LIMIT_PX
+from recordings.image_headers import SIDE_LIMIT_PX
 from recordings.schema.boards import board_problem
 from recordings.schema.messages import (
     BoardSpec,

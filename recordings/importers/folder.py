@@ -10,16 +10,8 @@ from typing import Any
 from recordings import strict_yaml
 from recordings.errors import ImportSourceError, wrong_size_error
 from recordings.files import read_beginning
-from recordings.images import (
-    IMAGE_LIMIT_BYTES,
-    KEPT_FORMATS,
-    ImageError,
-    Pixels,
-    decode_image,
-    encode_png,
-    pixel_format_of,
-    read_header,
-)
+from recordings.image_headers import IMAGE_LIMIT_BYTES, KEPT_FORMATS, ImageError, read_header
+from recordings.images import Pixels, decode_image, encode_png, pixel_format_of
 from recordings.importers.dataset import (
     DATASET_FILE,
     POSES_FILE,

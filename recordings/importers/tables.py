@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from recordings.files import read_beginning
-from recordings.images import LFS_POINTER
+from recordings.image_headers import LFS_POINTER
 from recordings.importers.messages import Array
 from recordings.importers.trees import IMAGE, IMAGE_SUFFIXES, POSE_SIZES, read_tree
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.images import ImageError, ImageHeader, decode_image, encode_png, raw_array, read_header
+from recordings.image_headers import ImageError, ImageHeader, read_header
+from recordings.images import decode_image, encode_png, raw_array
 from tests.recordings.small_recording import HEIGHT, WIDTH, make_image
 
 COLOUR = np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)

@@ -3,6 +3,7 @@
 An arm of Universal Robots, which the station moves
     ur                     the driver: starts control, moves, stops by both ways
     ur_link                reads the arm: identity, states, questions to the dashboard
+    robot_lock             one station for an arm on this computer
     ur_state, rtde         its state stream; packets of that stream
     ur_child, ur_control   the control process as its parent sees it; that process
     ur_script              control by the station's own script, where ur_rtde is missing

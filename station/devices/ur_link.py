@@ -22,12 +22,12 @@ from station.cell.layout import arm_model
 from station.cell.status import ArmCondition
 from station.devices.history import state_at
 from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
+from station.devices.robot_lock import LOCKS, RobotLock
 from station.devices.rtde import RobotMode
 from station.devices.ur_condition import condition, not_powered, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_probe import (
     Found,
-    RobotLock,
     check_script_port,
     identify,
     open_dashboard,
@@ -96,8 +96,10 @@ class UrLink:
         host = self.config.host
         found = await identify(await self.renew_dashboard())
         self._check_identity(found)
-        if self._lock is None:  # simulated robots share a serial number
-            self._lock = RobotLock(host if is_loopback(host) or not found.serial else found.serial)
+        if self._lock is None:
+            simulated = is_loopback(host)  # these share a serial number, and any user may have one
+            name = host if simulated or not found.serial else found.serial
+            self._lock = RobotLock(name, None if simulated else LOCKS)
         await check_script_port(host)
         reader = self.reader = StateReader(host, self._deliver, self.on_link_lost)
         first = await reader.open()

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 from calibrate.kinematics import MODELS
 from station.cell.errors import RobotError
-from station.cell.socket_folder import peer_of, user_name
 from station.devices.rtde import PORT as RTDE_PORT
 from station.devices.rtde import RtdeError, RtdeLink
 from station.devices.ur_dashboard import Dashboard, DashboardError, connect_trouble
@@ -95,35 +94,3 @@ async def check_script_port(host: str) -> None:
         raise RobotError("port-closed", where=where, reason=f"no answer within {CONNECT_S:g} s") from None
     except OSError as error:
         raise RobotError("port-closed", where=where, reason=connect_trouble(error, _SERVICE)) from None
-
-
-class RobotLock:
-    """Lock of a robot for one station on this computer, held from construction to `release`.
-
-    Raises RobotError that names the present owner.
-    """
-
-    def __init__(self, name: str) -> None:
-        address = f"\0calibration-station/robot/{re.sub(r'[^A-Za-z0-9.-]', '-', name)[:60]}"
-        self._held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            self._held.bind(address)
-            self._held.listen(1)
-        except OSError as error:
-            self._held.close()
-            raise RobotError("robot-owned", robot=name, owner=_owner(address) or str(error)) from None
-
-    def release(self) -> None:
-        self._held.close()
-
-
-def _owner(address: str) -> str:
-    """Name the owner of a lock: 'pid 4711, anna'; empty when it is gone or does not listen."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
-        link.setblocking(False)
-        try:
-            link.connect(address)
-        except OSError:
-            return ""
-        pid, uid, _ = peer_of(link)
-    return f"pid {pid}, {user_name(uid)}"

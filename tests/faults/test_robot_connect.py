@@ -245,7 +245,7 @@ async def test_safety_stop_between_moves_ends_control(cell: MakeCell) -> None:
 
 async def test_a_daemon_that_died_leaves_no_lock(arm: SimulatedController, tmp_path: Path) -> None:
     program = (
-        "import os, sys; from station.devices.ur_probe import RobotLock\n"
+        "import os, sys; from station.devices.robot_lock import RobotLock\n"
         "if os.getuid() == 0: os.setgid(65534); os.setuid(65534)  # another user's, where that can be tried\n"
         "lock = RobotLock(sys.argv[1]); print('held', flush=True); sys.stdin.read()"
     )

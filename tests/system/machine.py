@@ -11,8 +11,9 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 from tests.patience import PATIENCE_S, wait_until
 
@@ -120,6 +121,18 @@ class Machine:
         done = subprocess.run([*enter, *command], capture_output=True, text=True, timeout=PATIENCE_S)
         assert done.returncode == 0 or not check, f"{command}: {done.stdout}{done.stderr}\n{self.journal()}"
         return done.stdout
+
+    @contextlib.contextmanager
+    def running(self, *command: str) -> Iterator[IO[str]]:
+        """Run a command in the container until its input ends; give what it prints."""
+        enter = ["nsenter", "--target", str(self._leader()), "--all"]
+        pipe = subprocess.PIPE
+        with subprocess.Popen([*enter, *command], stdin=pipe, stdout=pipe, text=True) as process:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            yield process.stdout
+            process.stdin.close()
+            process.wait(PATIENCE_S)
 
     def journal(self) -> str:
         return self.run("journalctl", "--no-pager", "--lines=60", check=False)

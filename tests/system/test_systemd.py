@@ -30,6 +30,13 @@ SESSIONS = "/var/lib/station/sessions"
 DAEMON = ("setpriv", "--reuid=station", "--regid=station-operator", "--clear-groups")
 OPERATOR = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--groups=station-operator")
 SOLVER = ("setpriv", "--reuid=station-solver", "--regid=station-solver", "--init-groups")
+REFUSED = """
+from station.devices.robot_lock import RobotLock
+try:
+    RobotLock('4711')
+except Exception as error:
+    print(error.code)
+"""
 SANDBOXED = """
 import os, socket
 said = []
@@ -276,6 +283,35 @@ def test_who_reads_calibrations_needs_no_right_to_move_the_arm(machine: Machine)
     assert as_reader("cat", "/var/lib/station/calibrations/main/a") == "7\n"
     assert not as_reader("ls", "/var/lib/station", "/var/lib/station/sessions")
     machine.run("rm", "-r", "/var/lib/station/calibrations/main")
+
+
+def test_the_service_and_a_members_own_daemon_exclude_each_other(machine: Machine) -> None:
+    """Whoever else took the name of the lock first."""
+    lock = "import sys; from pathlib import Path; from station.devices.robot_lock import RobotLock; "
+    held = lock + "lock = RobotLock('4711'); print('held', flush=True); sys.stdin.read()"
+    python = ("env", f"PYTHONPATH={CHECKOUT}", f"{VENV}/bin/python", "-c")
+    stranger = ("setpriv", "--reuid=daemon", "--regid=daemon", "--clear-groups")
+    squats = held.replace("'4711'", "'4711', None")
+    tries = lock + "lock = RobotLock('4711'); Path('/var/lib/station/locked').touch()"
+    machine.drop_in(
+        "station.service",
+        "Type=oneshot",
+        "Restart=no",
+        f"Environment=PYTHONPATH={CHECKOUT}",
+        "ExecStart=",
+        f'ExecStart={VENV}/bin/python -c "{tries}"',
+    )
+    with machine.running(*stranger, *python, squats) as squatter:
+        assert squatter.readline() == "held\n"
+        assert machine.run(*stranger, *python, REFUSED) == "robot-lock\n"
+        machine.run("systemctl", "start", "station")
+        assert machine.path("/var/lib/station/locked").exists()
+        with machine.running(*OPERATOR, *python, held) as member:
+            assert member.readline() == "held\n"
+            machine.run("systemctl", "start", "station", check=False)
+            assert machine.show("station", "ExecMainStatus") == "1"
+    machine.run("systemctl", "reset-failed", "station", check=False)
+    machine.run("rm", "/var/lib/station/locked")
 
 
 def test_a_missing_configuration_is_said_once_and_not_started_again(machine: Machine) -> None:

@@ -136,11 +136,11 @@ def interrupted_session(root: Path) -> tuple[Path, SessionState] | None:
     if state is None or state.sealed:
         return None
     if state.first is None:
-        state = msgspec.structs.replace(state, first=_first_description(folder))
+        state = msgspec.structs.replace(state, first=first_description(folder))
     return folder, state
 
 
-def _first_description(folder: Path) -> SessionInfo | None:
+def first_description(folder: Path) -> SessionInfo | None:
     """Read what a session began with from its first segment; None where it cannot be read."""
     finished = segment_path(folder, 1)
     return description_of(finished) or description_of(finished.with_name(finished.name + PART_SUFFIX))

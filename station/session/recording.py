@@ -35,6 +35,7 @@ from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.session_folder import (
     SessionState,
     clear_active,
+    first_description,
     mark_active,
     new_session_folder,
     segment_path,
@@ -201,6 +202,8 @@ class SessionRecording:
     def _open(self, plan: Plan, first_image: Image | None, settings: dict[str, object]) -> None:
         config = self._cell.config
         require_free_space(self.folder, config.capture.free_space_bytes)
+        if self._first is None and self.segment > 1:
+            self._first = first_description(self.folder)  # recovery may have made it readable
         self.require_same_cell(first_image)
         info = msgspec.structs.replace(
             self._cell_info(first_image),

@@ -206,6 +206,27 @@ async def test_a_lens_that_is_told_otherwise_does_not_go_on(rig: Rig, next_daemo
     assert event.values["what"] == "lens"
 
 
+async def test_a_first_file_that_recovery_made_readable_is_compared_before_the_next(
+    folder: Path, next_daemon: NextDaemon
+) -> None:
+    state = read_state(folder)
+    assert state is not None
+    write_state(folder, msgspec.structs.replace(state, first=None))
+    [file] = folder.glob("*.mcap.part")
+    content = file.read_bytes()
+    begins = content.index(b"session")
+    file.write_bytes(content[:begins] + b"?" + content[begins + 1 :])
+    rig = await next_daemon(other_robot)
+    await rig.until(S.STOPPED)
+    await rig.session.acknowledge("anna")
+    rig.session.take_lease(1, "anna")
+    await rig.give_go(Purpose.RESUME)
+    await rig.until(S.PAUSED)
+    assert rig.cause == "interrupted-elsewhere"
+    assert "move" not in rig.arm.log
+    assert serials(folder) == {"DOUBLE"}
+
+
 async def test_without_any_file_the_plan_is_compared(folder: Path, next_daemon: NextDaemon) -> None:
     state = read_state(folder)
     assert state is not None

@@ -25,8 +25,12 @@ A client sends JSON lines of at most {messages.LINE_LIMIT_BYTES // 1024**2} MB t
 `error` is a sentence for a person. Programs decide on `problem.code`; `problem.values` holds its figures.
 STOP also has a socket of its own, for which no connection is needed ([safety](../operator/safety.md)).
 
-| verb | arguments | result | states | control | does |
-|---|---|---|---|---|---|
+The table says who may ask what. Control is given to the first client that needs it, and to one at a time.
+Where the station moves a real arm, some verbs need more: a person at a terminal or at the operator screen, as
+the kernel tells, or a service that the configuration names.
+
+| verb | arguments | result | states | control | of a real arm, it needs | does |
+|---|---|---|---|---|---|---|
 """
 
 
@@ -39,7 +43,7 @@ def _row(verb: type[Verb[Any]]) -> str:
     states = "any" if len(allowed) == len(StationState) else ", ".join(allowed)
     arguments = ", ".join(_argument(field) for field in msgspec.structs.fields(verb))
     control = "needed" if verb.control else ""
-    cells = (f"`{verb.verb()}`", arguments, _named(verb.result()), states, control, verb.help())
+    cells = (f"`{verb.verb()}`", arguments, _named(verb.result()), states, control, verb.needs, verb.help())
     return f"| {' | '.join(cells)} |\n"
 
 

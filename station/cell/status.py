@@ -299,6 +299,8 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Why the station is stopped, paused or at fault, and the remedy, for the screen's top bar."""
     cause: str = ""
     """The code of `reason`, for programs."""
+    services_barred: str = ""
+    """Why no service may approve motion until a person acknowledges; empty: services may."""
     pending: str = ""
     """Request that waits for the end of the pose under way: to pause or to finish."""
     source: Source = "real"

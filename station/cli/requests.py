@@ -52,6 +52,9 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     if status.lease.holder:
         words.append(f"control: {status.lease.holder}")
     out.print(", ".join(filter(None, words)))
+    if status.services_barred:
+        until = "No service may approve motion until a person acknowledges (`station acknowledge`)"
+        out.print(f"{until}: {status.services_barred}")
     words = ["camera not connected"]
     if camera.connected:
         words = [camera.model, f"{camera.counts.missing} frames dropped"]
@@ -80,6 +83,9 @@ def stop_command(socket: Socket = None) -> None:
 
 def acknowledge_command(socket: Socket = None) -> None:
     """Leave `stopped` or `fault` after looking at the cell. Nothing moves.
+
+    For a real arm it needs a person at a terminal: by ssh use `ssh -t HOST station acknowledge`. Until then
+    no service may approve motion either, and a restart of the daemon changes nothing.
 
     Next: `station resume` continues the session, `station finish` finishes it.
     """

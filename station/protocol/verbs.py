@@ -1,8 +1,9 @@
 """Table of the daemon's verbs: each class is a request that a client may send.
 
 Its fields are the arguments, its type parameter the result, its docstring the line of help; `states` says in
-which states it is allowed, `control` whether only the client that has control may ask. Dispatch, client,
-`--json` and docs/reference/protocol.md follow from it.
+which states it is allowed, `control` whether only the client that has control may ask, `needs` who must stand
+behind the client where the station moves a real arm. Dispatch, client, `--json` and
+docs/reference/protocol.md follow from it.
 """
 
 from __future__ import annotations
@@ -27,11 +28,25 @@ _ANY = frozenset(S)
 _LOADING = frozenset({S.IDLE, S.DISCONNECTED})
 
 
+class Needs(StrEnum):
+    """Who must stand behind a client, beside control, where the station moves a real arm.
+
+    The kernel tells who does (`server.approval`); what a client says of itself does not count.
+    """
+
+    NOBODY = ""
+    """Every member of the socket's group may ask."""
+    PERSON = "a person at a terminal"
+    """Also the person at the operator screen."""
+    PERSON_OR_SERVICE = "a person at a terminal, or a service with the hash while no latch is held"
+
+
 class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
     """A request with its arguments; `R`: the type of its result."""
 
     states: ClassVar[frozenset[S]] = _ANY
     control: ClassVar[bool] = True
+    needs: ClassVar[Needs] = Needs.NOBODY
     moves: ClassVar[bool] = False
     """For arms that the station moves only."""
     spoken: ClassVar[str] = ""
@@ -64,8 +79,11 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
         if state in cls.states:
             return None
         why, remedy = _NOT_NOW.get(state, (f"the session is {state.value}", "Pause or stop it first."))
-        if cls is Acknowledge:
-            why, remedy = "nothing is stopped", ""
+        return cls.refused_because(state, why, remedy)
+
+    @classmethod
+    def refused_because(cls, state: S, why: str, remedy: str) -> RefusedError:
+        """Make the error of a verb that is not possible in a state, for the reason that is given."""
         return RefusedError(
             "wrong-state",
             what=cls.spoken or cls.verb().replace("_", " "),
@@ -175,10 +193,14 @@ class Stop(Verb[Done], frozen=True):
 
 
 class Acknowledge(Verb[Done], frozen=True):
-    """Leave `stopped` or `fault` after a person looked."""
+    """Leave `stopped` or `fault` after a person looked, and let services approve motion again.
 
-    states = LATCHED
+    After a lost connection the station rests and is not latched: there it only lets services approve again.
+    """
+
+    states = LATCHED | RESTING | {S.DISCONNECTED}
     control = False
+    needs = Needs.PERSON
     cause: str = ""
     """Of the state that was seen, of which alone it is; empty: of whatever stands."""
 
@@ -225,7 +247,7 @@ class StopTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Prepare(Verb[MotionPreview], frozen=True):
-    """Check the whole path from where the arm is and offer its approval."""
+    """Check the whole path from where the arm is and offer its approval; a stop test only to a person."""
 
     states = RESTING
     moves = True
@@ -236,9 +258,10 @@ class Prepare(Verb[MotionPreview], frozen=True):
 
 
 class Go(Verb[Done], frozen=True):
-    """Approve exactly the motion that was offered, once."""
+    """Approve exactly the motion that was offered, once; a stop test is approved by a person only."""
 
     states = RESTING
+    needs = Needs.PERSON_OR_SERVICE
     moves = True
     spoken = "starting a motion"
     token: str

@@ -78,6 +78,16 @@ class Peer:
         return f"{self.user or f'uid {self.uid}'}{place} (pid {self.pid})"
 
 
+@dataclass(frozen=True)
+class Approval:
+    """Permission that was given to start an offered motion."""
+
+    how: str
+    """How it was given, for log and recording: 'at pts/3', 'as a service, …'."""
+    by_person: bool
+    """A person at a terminal gave it, who has looked at the cell; False: a service or a simulated cell."""
+
+
 class ApprovalRule:
     """Rule that decides who may approve motion. `see`: function that looks a process up."""
 
@@ -94,7 +104,10 @@ class ApprovalRule:
             peer.terminal = self.terminal(peer)
 
     def by_person(self, asks: Peer, what: str) -> str:
-        """Check that a person may approve from this client; return how, for the log. Else RefusedError."""
+        """Check that a person may approve from this client; return how, for the log. Else RefusedError.
+
+        `what`: what the person is needed for, as the error names it: "A stop test".
+        """
         if self._simulated:
             return "a simulated cell"
         if terminal := self.terminal(asks):
@@ -103,22 +116,29 @@ class ApprovalRule:
         if service := self._service(asks):
             raise RefusedError("service-terminal", what=what, service=service)
         raise RefusedError(
-            "no-terminal", what=what, advice="A person must review and approve it there (docs: Safety)."
+            "no-terminal",
+            what=what,
+            advice="A person must look, and do it there (docs: Safety). By ssh use `ssh -t`.",
         )
 
-    def approve(self, asks: Peer, sha256: str, offered_sha256: str) -> str:
-        """Check as `by_person`, or that a configured service names the hash of what is offered."""
+    def approve(self, asks: Peer, sha256: str, offered_sha256: str, barred: str) -> Approval:
+        """Check as `by_person`, or that a configured service names the hash of what is offered.
+
+        `barred`: why no service may approve until a person has acknowledged; empty: services may.
+        """
         if sha256 and offered_sha256 and sha256 != offered_sha256:
             raise RefusedError("other-plan")
         if self._simulated or self.terminal(asks):
-            return self.by_person(asks, "A move")
+            return Approval(self.by_person(asks, "A move"), by_person=not self._simulated)
         if asks.user not in self._config.services:
             if service := self._service(asks):
                 raise RefusedError("service-terminal", what="A move", service=service)
             raise RefusedError("no-service", user=asks.user)
+        if barred:
+            raise RefusedError("services-barred", user=asks.user, reason=barred)
         if not sha256:
             raise RefusedError("no-plan-named", user=asks.user)
-        return "as a service, by the hash of plan and cell"
+        return Approval("as a service, by the hash of plan and cell", by_person=False)
 
     def terminal(self, asks: Peer) -> str:
         """Name the terminal in whose foreground this client's person sees it; empty: none."""

@@ -12,7 +12,7 @@ from station.cell.socket_folder import user_name
 from station.cell.status import StationState, StationStatus
 from station.protocol import verbs
 from station.protocol.verbs import VERBS, Verb
-from station.server.approval import ApprovalRule, Peer, Process, process
+from station.server.approval import Approval, ApprovalRule, Peer, Process, process
 from station.session.checklist import checklist
 from station.session.session import Session
 from station.session.threads import NAMES
@@ -97,6 +97,9 @@ class SessionDispatcher:
             case verbs.Release():
                 await self._to_the_end(session.release(client, verb.silent))
             case verbs.Acknowledge():
+                session.require_latched()
+                if session.latch.needs_person:
+                    self._rule.by_person(await self._named(caller), "Acknowledging STOP or a fault")
                 await session.acknowledge(caller.who, verb.cause)
             case verbs.GetPlan():
                 queue = context.queue
@@ -111,7 +114,8 @@ class SessionDispatcher:
                 return await session.prepare(client, verb.purpose, verb.stop_test)
             case verbs.Go():
                 approval = await self._approval(caller, verb.approval_sha256)
-                await session.go(client, verb.token, approval)
+                said = f"motion approved by {caller.who}, {approval.how}"
+                await session.go(client, verb.token, said, by_person=approval.by_person)
             case verbs.Pause():
                 session.pause(caller.who)
             case verbs.Finish():
@@ -130,14 +134,14 @@ class SessionDispatcher:
                 return await checklist(context, session.devices.troubles)
         return None
 
-    async def _approval(self, caller: Peer, sha256: str) -> str:
-        """Check that this client may approve what is offered; return who did, and how."""
-        asks, waiting = await self._named(caller), self._session.approvals.waiting
+    async def _approval(self, caller: Peer, sha256: str) -> Approval:
+        """Check that this client may approve what is offered. RefusedError where it may not."""
+        asks = await self._named(caller)
+        waiting = self._session.approvals.waiting
         if waiting is not None and waiting.motion.stop_test is not None:
-            how = self._rule.by_person(asks, "A stop test")
-        else:
-            how = self._rule.approve(asks, sha256, waiting.preview.approval_sha256 if waiting else "")
-        return f"motion approved by {caller.who}, {how}"
+            return Approval(self._rule.by_person(asks, "A stop test"), by_person=True)
+        offered_sha256 = waiting.preview.approval_sha256 if waiting is not None else ""
+        return self._rule.approve(asks, sha256, offered_sha256, self._session.latch.bars_services)
 
     async def _named(self, caller: Peer) -> Peer:
         caller.user = await self._name(caller.uid)

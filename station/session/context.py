@@ -24,7 +24,7 @@ from station.cell.status import Event, Level, SessionStatus, StationState, Stati
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import ready
 from station.devices.cell import Cell
-from station.protocol.states import check_transition
+from station.protocol.states import LATCHED, check_transition
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from station.session.threads import DISK
@@ -218,6 +218,8 @@ class StatusStore:
         self._watchers: list[Callable[[], None]] = []
         self.recorded: Callable[[Event], None] = lambda event: None
         """Called for every event, to record it."""
+        self.latched: Callable[[str, str, StationState], None] = lambda reason, cause, state: None
+        """Called with reason, cause and state when `stopped` or `fault` is entered, to hold the latch."""
 
     @property
     def state(self) -> StationState:
@@ -247,6 +249,8 @@ class StatusStore:
         if isinstance(reason, CodedError):
             cause = reason.code
         self.update(state=state, reason=str(reason), cause=cause)
+        if state in LATCHED:
+            self.latched(str(reason), cause, state)
 
     def event(
         self, code: str, text: str, level: Level = "info", pose_index: int | None = None, /, **values: Value

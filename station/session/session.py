@@ -34,6 +34,7 @@ from station.session.device_connector import DeviceConnector
 from station.session.ending import close_or_seal
 from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
+from station.session.latch import Latch, LatchKeeper
 from station.session.motion import ApprovalManager, offered, session_motion
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue, refused
@@ -48,6 +49,8 @@ END_RUN_S = 10.0
 """Longest wait for a run to end before what must follow it is refused."""
 END_RUN_AT_CLOSE_S, CLOSE_DEVICES_S = 1.0, 1.8
 """Longest waits at the daemon's end for a run and for devices."""
+LATCH_WRITTEN_S = 1.0
+"""Longest wait, at the daemon's end and for an acknowledgement, until the file of the latch is written."""
 STOP_WAIT_S = 1.0
 """Longest time that the answer to STOP, sent after the arm was stopped, waits for data being written."""
 PLAN_TIMEOUT_S = 180.0
@@ -65,7 +68,6 @@ class Session:
         self.context = SessionContext(cell, self.store, Workers(start_worker), monitor, root)
         # This clock goes on while the computer sleeps: no offer outlives that.
         self.approvals = ApprovalManager(lambda: time.clock_gettime(time.CLOCK_BOOTTIME))
-        self.supervisor = SessionSupervisor(self.context, self.approvals.void)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context, self.previews)
@@ -81,19 +83,41 @@ class Session:
         cell.arm.subscribe(monitor.add)
         cell.arm.subscribe(self.context.record_state)
         self.store.recorded = self.context.record_event
+        self.latch = LatchKeeper(root, cell.source, cell.mover is not None, self._show_latch)
+        self.store.latched = self.latch.hold
+        self.supervisor = SessionSupervisor(self.context, self.approvals.void, self.latch.hold)
         self.store.watch(self._estimator.poke)
 
     async def start(self) -> None:
         """Connect devices (read-only, with retries) and restore a session that a crash interrupted."""
         self.context.root.mkdir(parents=True, exist_ok=True)
+        left_latched = await DISK.run(self.latch.read)
+        self.latch.begin_with(left_latched)
         found = await DISK.run(interrupted_session, self.context.root)
         if found is not None:
             self.context.restore(*found)
+        if left_latched is not None:
+            self._enter_latched(left_latched)
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
         watching = self.supervisor.run, self.supervisor.monitor.watch_files
-        loops = (*watching, self.devices.run, self._estimator.run, self.freedrive.run)
+        loops = (*watching, self.latch.run, self.devices.run, self._estimator.run, self.freedrive.run)
         self._tasks = [asyncio.create_task(self.kept_going(loop)) for loop in loops]
+
+    def _enter_latched(self, left: Latch) -> None:
+        """Begin in the latched state that an earlier daemon on this folder left."""
+        store = self.store
+        if left.state is None:
+            store.event("services-barred", f"Services may not approve motion yet: {left.reason}", "warning")
+            return
+        if store.state in LATCHED:  # by an interrupted session, which says what is saved
+            store.update(reason=f"{store.status.reason} Before that: {left.reason}")
+        else:
+            store.enter(StationState(left.state), left.reason, left.cause)
+        store.event("latched-before", f"Latched since before this daemon began: {left.reason}", "warning")
+
+    def _show_latch(self, latch: Latch | None) -> None:
+        self.store.update(services_barred=latch.reason if latch is not None and latch.needs_person else "")
 
     async def kept_going(self, loop: Callable[[], Awaitable[object]]) -> None:
         """Run a task of the daemon's life; a defect in it ends in fault, then it begins again."""
@@ -130,6 +154,7 @@ class Session:
             with contextlib.suppress(RecordingError):
                 path = await context.recording.seal(context.loaded())
                 self.store.event("finished", f"finished before the end: {path}", path=str(path))
+        await self.latch.settled(LATCH_WRITTEN_S)
         for task in self._tasks:
             task.cancel()
         context.workers.close()
@@ -163,6 +188,7 @@ class Session:
         self.store.update(lease=LeaseStatus())
         if self.store.state in RUNNING:
             reason = how.format(lease.holder) + " Approve again to continue."
+            self.latch.hold(reason, "control-lost")
             await self._halt(self.context.resting, reason, "control-lost")
 
     async def _halt(self, state: StationState, reason: str, cause: str) -> None:
@@ -186,19 +212,32 @@ class Session:
             await mover.stop(reason)
 
     async def acknowledge(self, who: str, cause: str = "") -> None:
-        """Leave `stopped` or `fault` after a person looked at the cell; `cause`: only what stands for it."""
-        self._require_state(verbs.Acknowledge)
+        """End the latch after a person looked at the cell, and leave `stopped` or `fault`.
+
+        `cause`: only of a state that has this cause; empty: whatever is latched. Whether the client may do it
+        was decided before (`server.dispatch`). RefusedError when nothing is latched, or STOP came meanwhile.
+        """
+        self.require_latched()
         stops = self._stops
         try:
             await fresh(self.context.cell.arm)
             resting = self.context.resting
         except RobotError:
             resting = StationState.DISCONNECTED
-        self._require_state(verbs.Acknowledge)
+        self.require_latched()
         if self._stops != stops or (cause and cause != self.store.status.cause):
             raise RefusedError("stopped-again")
-        self.store.enter(resting)
+        self.latch.release()
+        if self.store.state in LATCHED:
+            self.store.enter(resting)
         self.store.event("acknowledged", f"acknowledged by {who}", who=who)
+        await self.latch.settled(LATCH_WRITTEN_S)
+
+    def require_latched(self) -> None:
+        """Raise RefusedError where there is nothing that a person could acknowledge."""
+        self._require_state(verbs.Acknowledge)
+        if self.latch.held is None:
+            raise verbs.Acknowledge.refused_because(self.store.state, "nothing is stopped", "")
 
     # -- from a question to a motion ---------------------------------------------------------------------
 
@@ -224,10 +263,11 @@ class Session:
         self.approvals.offer(offer)
         return offer.preview
 
-    async def go(self, client_id: int, token: str, approval: str = "") -> None:
-        """Start the offered motion, which a person approved. RefusedError when anything changed.
+    async def go(self, client_id: int, token: str, approval: str = "", by_person: bool = False) -> None:
+        """Start the offered motion, which was approved. RefusedError when anything changed.
 
-        `approval`: who approved and how, for log and recording.
+        `approval`: who approved and how, for log and recording. `by_person`: a person at a terminal, who has
+        looked at the cell and so lets services approve again after a lost connection.
         """
         context = self.context
         self.permit(verbs.Go, client_id)
@@ -247,6 +287,8 @@ class Session:
                 context.forget_session(check=motion.purpose is Purpose.DRIFT_CHECK)
             context.queue = motion.queue
             context.show_poses()
+        if by_person:
+            self.latch.release_bar()
         self.store.enter(StationState.CHECKING)
         self.store.event("approved", go.said, approval_sha256=go.preview.approval_sha256)
         self._run = asyncio.create_task(run.drive())

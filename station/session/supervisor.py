@@ -16,7 +16,7 @@ from collections.abc import Callable
 import msgspec
 
 from station.cell.config import SPEED_CAP_M_S
-from station.cell.errors import RobotError, StaleStateError
+from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.cell.layout import cell_geometry
 from station.cell.limits import point_speed_m_s
 from station.cell.status import CameraStatus, RecorderStatus, RobotStatus, StationState, TriggerStatus
@@ -114,10 +114,19 @@ STATUS_TICKS = 5
 
 
 class SessionSupervisor:
-    def __init__(self, context: SessionContext, void_approvals: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        context: SessionContext,
+        void_approvals: Callable[[], None],
+        hold_latch: Callable[[str, str], None],
+    ) -> None:
+        """`hold_latch`: holds the session's latch, with reason and cause, without a change of state."""
         self._context = context
         self.monitor = Monitor(context)
         self._void_approvals = void_approvals
+        self._hold_latch = hold_latch
+        self._safety_stopped = False
+        """The controller's own safety held the arm when its state was last seen."""
         self.before_round: Callable[[], None] = lambda: None
         """Called at the begin of every round: the daemon reads STOP's socket here, too."""
         self.after_round: Callable[[], None] = lambda: None
@@ -169,12 +178,33 @@ class SessionSupervisor:
                 store.problem(error)
             return
         self._lost_code = ""
+        self._watch_safety()
         if self._late_since_s:
             self._report_delay(self._late_since_s)
             self._late_since_s = 0.0
         if store.state is StationState.DISCONNECTED:
             store.enter(self._context.resting)
             store.event("robot-connected", "robot connected")
+
+    def _watch_safety(self) -> None:
+        """Bar services when the controller's safety stops an arm that rests.
+
+        In a run the run itself ends as `stopped`.
+        """
+        cell, before = self._context.cell, self._safety_stopped
+        if cell.mover is None:
+            return
+        try:
+            cell.arm.check()
+        except SafetyStopError as error:
+            self._safety_stopped = True
+            if not before:
+                self._void_approvals()
+                self._hold_latch(str(error), error.code)
+            return
+        except RobotError:
+            return
+        self._safety_stopped = False
 
     def _report_delay(self, since_s: float) -> None:
         """Report what made states of a resting arm late."""

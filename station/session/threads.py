@@ -27,6 +27,8 @@ DISK = WorkThreads("disk", 3)
 """Files of the session"""
 ASKED = WorkThreads("asked", 4)
 """Requests of clients for files and devices; the server bounds their number"""
+LATCH = WorkThreads("latch", 1)
+"""The file of the latch; one thread, so that what is written last stays"""
 WATCH = WorkThreads("watch", 1)
 """Files of which the status tells"""
 NAMES = WorkThreads("names", 2)

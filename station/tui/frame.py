@@ -219,6 +219,7 @@ ASKS: dict[str, type[Verb[Any]]] = {
 }
 """Verb by the action of a key that asks the daemon for it."""
 NEEDS: dict[str, Callable[[Known], object]] = {
+    "acknowledge": lambda now: now.shown.state in LATCHED or now.shown.services_barred,
     "solve_newest": lambda now: now.shown.session.recording and not now.result,
     "act('install')": lambda now: now.result and (now.result.state.withdrawn or not now.result.installed),
     **dict.fromkeys(("act('undo')", "app.drift_check"), lambda now: now.result and now.result.state.now),

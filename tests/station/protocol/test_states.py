@@ -9,7 +9,7 @@ import pytest
 from station.cell.status import StationState as S
 from station.cell.status import StationStatus
 from station.protocol.states import RUNNING, TRANSITIONS, TransitionError
-from station.protocol.verbs import Acknowledge, Go, Prepare, Stop
+from station.protocol.verbs import Acknowledge, Go, Needs, Prepare, Stop
 from station.session.context import StatusStore
 
 PAIRS = list(itertools.product(S, S))
@@ -60,5 +60,6 @@ def test_stop_is_always_possible_and_a_go_only_at_rest() -> None:
     assert Stop.states == frozenset(S)
     assert Go.states == Prepare.states == {S.IDLE, S.PAUSED}
     assert not RUNNING & Go.states
-    assert Acknowledge.states == {S.STOPPED, S.FAULT}
+    assert Acknowledge.states == {S.STOPPED, S.FAULT, S.IDLE, S.PAUSED, S.DISCONNECTED}
+    assert Acknowledge.needs is Needs.PERSON and Go.needs is Needs.PERSON_OR_SERVICE
     assert Go.control and Prepare.control and not Stop.control

@@ -196,8 +196,15 @@ def quaternion_from_matrix(R: ArrayLike) -> Array:
 
 
 def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Array:
-    """Convert quaternions (..., 4) x, y, z, w (any positive norm) to (..., 3, 3)."""
-    return rotation_exp(_rotation_vector(np.asarray(quaternion_xyzw, dtype=float)))
+    """Convert quaternions (..., 4) x, y, z, w (any positive norm) to (..., 3, 3).
+
+    ValueError for a quaternion of zeros, or with a number that is not finite: it is no rotation.
+    """
+    q = np.asarray(quaternion_xyzw, dtype=float)
+    length = np.linalg.norm(q, axis=-1)
+    if not (np.isfinite(length) & (length > 0)).all():
+        raise ValueError("a quaternion of zeros, or one that is not finite, is no rotation")
+    return rotation_exp(_rotation_vector(q))
 
 
 def pose_from_quaternion(translation_m: ArrayLike, quaternion_xyzw: ArrayLike) -> Array:

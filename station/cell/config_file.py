@@ -115,6 +115,13 @@ def _contradictions(config: StationConfig) -> Iterator[Problem]:
         check_board(config.board)
     except BoardError as problem:
         yield "board", problem.text.removeprefix("board: "), problem.remedy
+    yield from guess_problems(config)
+    if config.camera.model is not None:
+        yield from _lens_problems(config.camera.model)
+
+
+def guess_problems(config: StationConfig) -> Iterator[Problem]:
+    """Find initial poses that are no rotation, also in a configuration that was read from a recording."""
     guesses: dict[str, PoseGuess | None] = {
         "camera_guess": config.camera_guess,
         "board_guess": config.board_guess,
@@ -123,8 +130,6 @@ def _contradictions(config: StationConfig) -> Iterator[Problem]:
         if guess is not None and not 0.9 < float(np.linalg.norm(guess.rotation_xyzw)) < 1.1:
             text = "its length must be 1 (x, y, z, w)"
             yield f"{name}.rotation_xyzw", text, "`station new` finds it without one."
-    if config.camera.model is not None:
-        yield from _lens_problems(config.camera.model)
 
 
 def _is_calibrated(robot: RobotConfig) -> bool:

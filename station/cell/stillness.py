@@ -32,9 +32,12 @@ _DECADES = 3.0
 KEPT_SAMPLES = 4096
 
 
-def _speed_rad_s(state: RobotState) -> float:
-    """Speed of the fastest joint; 0 where none is told."""
-    return max(map(abs, state.joint_speeds_rad_s), default=0.0)
+def fastest_rad_s(state: RobotState) -> float:
+    """Speed of the fastest joint; 0 where none is told, infinite where one is not finite: it may move."""
+    speeds = state.joint_speeds_rad_s
+    if not all(map(math.isfinite, speeds)):
+        return math.inf
+    return max(map(abs, speeds), default=0.0)
 
 
 class NotStillError(StationError):
@@ -61,7 +64,7 @@ class StillnessMonitor:
         if states and now_s <= states[-1].stamps.controller_s:
             states.clear()  # the controller restarted
         away_m = math.dist(state.tcp_pose[:3], self._rested_m)
-        if not states or away_m > self._limits.position_m or self._turns(state):
+        if not states or not away_m <= self._limits.position_m or self._turns(state):
             self.moved_ns, self._rested_m = state.stamps.host_monotonic_ns, state.tcp_pose[:3]
         states.append(state)
         while states[0].stamps.controller_s < now_s - 1.5 * self._limits.window_s:
@@ -86,7 +89,7 @@ class StillnessMonitor:
         position_m, rotation_rad = scatter(pose_from_rotvec(poses[:, :3], poses[:, 3:]))
         return Stillness(
             window_s=float(times[-1] - times[0]),
-            max_joint_speed_rad_s=max(_speed_rad_s(s) for s in window),
+            max_joint_speed_rad_s=max(fastest_rad_s(s) for s in window),
             position_scatter_m=position_m,
             rotation_scatter_rad=rotation_rad,
             image_motion_px=image_motion_px,
@@ -99,7 +102,7 @@ class StillnessMonitor:
         return ", ".join(
             f"{what} {scale * value:.{digits}f}{unit} (limit {scale * limit:.{digits}f})"
             for value, limit, scale, what, unit, digits in self._checks(found)
-            if value is not None and value > limit
+            if value is not None and not value <= limit
         )
 
     def rest(self, found: Stillness) -> float:
@@ -110,7 +113,7 @@ class StillnessMonitor:
     def _checks(self, found: Stillness) -> tuple[tuple[float | None, float, float, str, str, int], ...]:
         """Pair what was measured with its limit, and scale, name, unit and digits for people."""
         limits, speed_rad_s, joint = self._limits, found.max_joint_speed_rad_s, ""
-        if speed_rad_s > limits.joint_speed_rad_s:
+        if not speed_rad_s <= limits.joint_speed_rad_s:
             speeds = np.abs([s.joint_speeds_rad_s for s in self._states.copy()]).max(axis=0)
             joint = f"joint {JOINT_NAMES[int(speeds.argmax())]}"
         return (
@@ -167,7 +170,7 @@ class StillnessMonitor:
             await asyncio.sleep(POLL_S)
 
     def _turns(self, state: RobotState) -> bool:
-        return _speed_rad_s(state) > self._limits.joint_speed_rad_s
+        return fastest_rad_s(state) > self._limits.joint_speed_rad_s
 
     def require_rest(self, state: RobotState) -> None:
         """Raise NotStillError when the arm moved in this state, as it may move after having settled.

@@ -155,6 +155,13 @@ class Mover(Protocol):
     async def stop(self, reason: str) -> None:
         """Decelerate now, by control process and dashboard alike; idempotent, in any state, never raises."""
 
+    def after_stop(self, state: RobotState) -> bool:
+        """Tell whether a state was sampled after the newest stop had arrived at the controller.
+
+        Only such a state can say that the arm rests: an older one may be from before a move that had just
+        begun. True where no stop was sent.
+        """
+
     async def end_control(self) -> None:
         """Stop the control program and end its process."""
 

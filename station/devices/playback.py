@@ -30,6 +30,7 @@ from recordings.schema.messages import (
 from station.cell.arm_acceptance import StopWay
 from station.cell.clock_fit import ClockFit
 from station.cell.config import StationConfig, vector6
+from station.cell.config_file import guess_problems
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.layout import pose_vector
 from station.cell.pose_plan import Plan, PlannedPose
@@ -209,6 +210,9 @@ class PlaybackRobot:
     def stop_one_way(self, way: StopWay) -> None:
         raise RobotError("playback")
 
+    def after_stop(self, state: RobotState) -> bool:
+        return True
+
     async def stop(self, reason: str) -> None:
         self.control = False
 
@@ -244,6 +248,8 @@ def playback_cell(recording: Path) -> Cell:
         recorded = strict_yaml.load(content, StationConfig)
     except strict_yaml.StrictYamlError as error:
         raise ConfigError("no-config", recording=recording, name=CONFIG_NAME, reason=str(error)) from error
+    for key, wrong, _ in guess_problems(recorded):
+        raise ConfigError("no-config", recording=recording, name=CONFIG_NAME, reason=f"{key}: {wrong}")
     camera = msgspec.structs.replace(
         recorded.camera, driver="playback", device=str(recording), trigger="software"
     )

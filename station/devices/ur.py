@@ -19,9 +19,9 @@ from recordings.schema.messages import RobotState
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
-from station.cell.stillness import RESTING_RAD_S
+from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
 from station.devices.base import fresh, ready
-from station.devices.news import RESTING_S, Delay
+from station.devices.news import CURRENT_S, RESTING_S, Delay
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import arm_held, control_ended, foreign_program
@@ -37,6 +37,9 @@ log = logging.getLogger(__name__)
 TOOL_S = 0.04
 """Period of the checks of TCP and payload during a move; each takes up to a millisecond."""
 ONE_WAY_S = 1.0
+UNCONFIRMED_S = 0.5
+"""A stop that the dashboard did not confirm counts as arrived after so long: without heartbeats the watchdog
+ends the control program after 0.2 s, and the arm brakes from full speed in 0.26 s."""
 STOP_WAIT_S = 0.05
 PROGRAM_START_S = 0.2
 UPLOADED_S = 1.0
@@ -85,6 +88,10 @@ class UrRobot(UrLink):
         """When the stop test triggered its single stop (host monotonic); None before and after it."""
         self._tool_looked_s = 0.0
         """When TCP and payload were last checked during a move (host monotonic)."""
+        self._stop_sent_s: float | None = None
+        """When the newest stop of an arm that might have moved was sent (host monotonic); None: none was."""
+        self._stop_arrived_s: float | None = None
+        """When the dashboard's answer to it came (host monotonic); None: not yet, or no stop was sent."""
         self._background: set[asyncio.Task[object]] = set()
 
     @property
@@ -256,6 +263,8 @@ class UrRobot(UrLink):
         self._stop_reason = self._stop_reason or reason
         child, self._child, self.control = self._child, None, False
         reply: asyncio.Future[str] | None = None
+        if child is not None or self._stop_sent_s is None or not self._seen_at_rest():
+            self._stop_sent_s, self._stop_arrived_s = time.monotonic(), None
         try:
             try:
                 if child is not None:
@@ -263,12 +272,42 @@ class UrRobot(UrLink):
             finally:
                 if self.dashboard is not None and self.dashboard.alive:
                     reply = self.dashboard.send(STOP)
+                    reply.add_done_callback(self._note_arrival)
         except Exception:
             log.exception("a path of the stop failed")
         self._later(self._finish_stop(child, reply))  # even if a path failed above
         both = (reply, child.stop_acknowledged if child is not None else None)
         if waits := [w for w in both if w is not None]:
             await asyncio.wait(waits, timeout=STOP_WAIT_S)
+
+    def _seen_at_rest(self) -> bool:
+        try:
+            return fastest_rad_s(self.latest()) < RESTING_RAD_S
+        except RobotError:
+            return False
+
+    def _note_arrival(self, reply: asyncio.Future[str]) -> None:
+        """Note when the dashboard answered that it had stopped the program."""
+        answered = not reply.cancelled() and reply.exception() is None
+        if answered and reply.result() == STOPPED and self._stop_arrived_s is None:
+            self._stop_arrived_s = time.monotonic()
+
+    def after_stop(self, state: RobotState) -> bool:
+        """Tell whether a state was sampled, by the controller's clock, after the newest stop had arrived.
+
+        The time of a sample is known within the clock's bound; its latest possible delay is taken off.
+        """
+        if self._stop_sent_s is None:
+            return True
+        clock, stamps = self.clock(), state.stamps
+        if clock is None:
+            sampled_s = stamps.host_monotonic_ns / 1e9 - CURRENT_S
+        else:
+            bound_s = clock.bound_at(stamps.controller_s)
+            sampled_s = clock.to_host_ns(stamps.controller_s) / 1e9 - bound_s
+        if self._stop_arrived_s is not None:
+            return sampled_s > self._stop_arrived_s
+        return sampled_s > self._stop_sent_s + UNCONFIRMED_S
 
     def stop_one_way(self, way: StopWay) -> None:
         """End the move by only one stop path, for a stop test; others follow at rest or after `ONE_WAY_S`.
@@ -294,7 +333,7 @@ class UrRobot(UrLink):
         while self._one_way_s is not None and time.monotonic() < self._one_way_s + ONE_WAY_S:
             await asyncio.sleep(POLL_S)
             try:
-                if max(map(abs, self.latest().joint_speeds_rad_s)) < RESTING_RAD_S:
+                if fastest_rad_s(self.latest()) < RESTING_RAD_S:
                     return
             except RobotError:
                 return
@@ -333,7 +372,8 @@ class UrRobot(UrLink):
         try:
             dashboard = await Dashboard.open(self.config.host, timeout_s=1.0)
             try:
-                await dashboard.ask(STOP)
+                if await dashboard.ask(STOP) == STOPPED and self._stop_arrived_s is None:
+                    self._stop_arrived_s = time.monotonic()
             finally:
                 await dashboard.close()
         except RobotError as error:

@@ -263,6 +263,8 @@ class UrLink:
             return not_connected(self.config.host)
         if reader.ended is not None:
             return link_lost(reader.ended)
+        if reader.not_finite:
+            return StaleStateError("state-not-finite", age_s=age_s, limit_s=limit_s)
         cause, remedy = "", "Check cable and network."
         if reader.stands_still:
             cause, remedy = ": the controller's clock stands still", "Restart the controller."

@@ -71,8 +71,13 @@ def beside(
     gone = [q - a for a, q in zip(start_rad, joints_rad, strict=True)]
     length = sum(w * w for w in way)
     share = min(max(sum(g * w for g, w in zip(gone, way, strict=True)) / length, 0.0), 1.0) if length else 0.0
-    off = [abs(g - share * w) for g, w in zip(gone, way, strict=True)]
+    off = [_or_infinite(abs(g - share * w)) for g, w in zip(gone, way, strict=True)]
     return off.index(max(off)), max(off)
+
+
+def _or_infinite(value: float) -> float:
+    """Count what is not finite as infinitely far: the largest of NaN and a number depends on their order."""
+    return value if math.isfinite(value) else math.inf
 
 
 @dataclass
@@ -97,9 +102,9 @@ class MoveWatch:
         if (trouble := control_ended(state)) is not None:
             raise trouble
         joint, off_rad = beside(self.start_rad, self.target_rad, state.joints_rad)
-        if off_rad > STRAYED_RAD:
+        if not off_rad <= STRAYED_RAD:
             raise RobotError("off-path", joint=joint + 1, off_rad=off_rad, limit_rad=STRAYED_RAD)
-        distances = [abs(q - t) for q, t in zip(state.joints_rad, self.target_rad, strict=True)]
+        distances = [_or_infinite(abs(q - t)) for q, t in zip(state.joints_rad, self.target_rad, strict=True)]
         distance_rad = max(distances)
         if abs(distance_rad - self._distance_rad) > PROGRESS_RAD:
             self._distance_rad = distance_rad

@@ -7,6 +7,7 @@ for the next connection a new one is made.
 from __future__ import annotations
 
 import asyncio
+import math
 import socket
 import struct
 import time
@@ -15,6 +16,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from recordings.schema.messages import RobotState, Stamps
+from station.cell.errors import StaleStateError
 from station.devices.clocks import ClockEstimator, monotonic_from_wall_ns
 from station.devices.history import HISTORY_S
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, Recipe, RtdeError, RtdeLink
@@ -76,6 +78,8 @@ class StateReader:
         self.clock = ClockEstimator()
         self.stands_still = False
         """True when the controller time of the newest packet did not advance."""
+        self.not_finite = False
+        """True when a number of the newest packet was NaN or infinite: it told nothing."""
         self.ended: str | None = None
         """Why the connection is over; None while it lives."""
         self._on_state = on_state
@@ -94,7 +98,10 @@ class StateReader:
         try:
             self._rtde, self._recipe = await asyncio.to_thread(self._connect)
             self._follow()
+            give_up_s = time.monotonic() + SILENCE_S
             while self.newest is None and self.ended is None:
+                if self.not_finite and (late_s := time.monotonic() - give_up_s) > 0:
+                    raise StaleStateError("state-not-finite", age_s=SILENCE_S + late_s, limit_s=SILENCE_S)
                 await asyncio.sleep(POLL_S)
         except BaseException as error:
             self.close(_reason(error, self.host))
@@ -186,6 +193,10 @@ class StateReader:
         if kind != PacketType.DATA:
             return
         v = self._recipe.unpack_elements(payload)
+        # What guards motion compares numbers, and NaN is neither above nor below any limit.
+        self.not_finite = not all(map(math.isfinite, v))
+        if self.not_finite:
+            return
         controller_s = v[0]
         before = self.newest
         if before is not None:

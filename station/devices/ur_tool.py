@@ -29,7 +29,7 @@ from recordings.schema.messages import ArmKinematics, RobotState, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError
 from station.cell.layout import pose_vector
-from station.cell.stillness import RESTING_RAD_S
+from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
 from station.devices.ur_state import Payload
 
 log = logging.getLogger(__name__)
@@ -185,7 +185,7 @@ class TcpCheck:
             theta, a, d, alpha = installation.dh
             stated = replace(model, theta_rad=theta, a_m=a, d_m=d, alpha_rad=alpha)
             self._try_controllers_model(stated, first)
-        if self._stated is None and max(map(abs, first.joint_speeds_rad_s)) > RESTING_RAD_S:
+        if self._stated is None and fastest_rad_s(first) > RESTING_RAD_S:
             raise RobotError("tcp-moving")  # derived in motion, it would be millimetres off
         self._first = _flange_from_tcp(self._model, first)
         length_m = float(np.linalg.norm(self._first[:3, 3]))
@@ -256,7 +256,8 @@ class TcpCheck:
 def check_payload(now: Payload, first: Payload) -> None:
     """Raise RobotError when the payload on the pendant differs from that at connect."""
     centre_off_m = math.dist(now.centre_m, first.centre_m)
-    if abs(now.mass_kg - first.mass_kg) > PAYLOAD_TOLERANCE_KG or centre_off_m > CENTRE_TOLERANCE_M:
+    same_mass = abs(now.mass_kg - first.mass_kg) <= PAYLOAD_TOLERANCE_KG
+    if not (same_mass and centre_off_m <= CENTRE_TOLERANCE_M):  # nor is NaN the same
         raise RobotError(
             "payload-changed", before_kg=first.mass_kg, now_kg=now.mass_kg, centre_off_m=centre_off_m
         )
@@ -278,7 +279,9 @@ def _pose(vector: Vector6) -> Array:
 
 
 def _exceeds(delta: Array, tolerance: tuple[float, float]) -> bool:
-    return bool(np.linalg.norm(delta[:3]) > tolerance[0] or np.linalg.norm(delta[3:]) > tolerance[1])
+    """Tell whether a pose difference (6,), m and rad, is above a tolerance; NaN is above every one."""
+    near = np.linalg.norm(delta[:3]) <= tolerance[0] and np.linalg.norm(delta[3:]) <= tolerance[1]
+    return not near
 
 
 def _compare(found: Array, reference: Array, tolerance: tuple[float, float], code: str, model: str) -> None:

@@ -10,7 +10,9 @@ import msgspec
 from station.cell.errors import RefusedError, RobotError
 from station.cell.socket_folder import user_name
 from station.cell.status import StationState, StationStatus
+from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
 from station.protocol import verbs
+from station.protocol.stop_client import ArmMotion
 from station.protocol.verbs import VERBS, Verb
 from station.server.approval import Approval, ApprovalRule, Peer, Process, process
 from station.session.checklist import checklist
@@ -39,13 +41,23 @@ class SessionDispatcher:
         return self.status.state is StationState.STOPPED
 
     @property
-    def speed_rad_s(self) -> float | None:
-        """Speed of the arm's fastest joint now; None where it is not known."""
+    def motion(self) -> ArmMotion:
+        """Tell whether the arm moves now.
+
+        While STOP is latched an arm rests only by a state that is from after STOP arrived at its controller.
+        """
+        cell = self._session.context.cell
         try:
-            speeds = self._session.context.cell.arm.latest().joint_speeds_rad_s
+            state = cell.arm.latest()
         except RobotError:
-            return None
-        return max(map(abs, speeds), default=None)
+            return ArmMotion.UNKNOWN
+        if not state.joint_speeds_rad_s:
+            return ArmMotion.UNKNOWN
+        if not fastest_rad_s(state) <= RESTING_RAD_S:
+            return ArmMotion.MOVES
+        if self.latched and cell.mover is not None and not cell.mover.after_stop(state):
+            return ArmMotion.MOVES
+        return ArmMotion.RESTS
 
     def stop_by_client(self, peer: Peer) -> Awaitable[object]:
         """Begin STOP at once; return an awaitable for its end."""

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 
 from station.cell.errors import StationError
 from station.cell.socket_folder import bind, make_folder, motion_page, stop_socket
-from station.cell.stillness import RESTING_RAD_S
 from station.protocol.stop_client import ArmMotion, Page, create_page, write_page
 from station.server.approval import Peer
 
@@ -33,8 +32,6 @@ PAUSE_S = 0.02
 """Pause after a datagram before the next ones are read together, so that a flood costs little."""
 REPEAT_S = 0.1
 """Shortest period at which a latched STOP is sent again to a resting arm."""
-SETTLE_S = 0.05
-"""Time after STOP before an arm can count as resting, as a move may just have begun."""
 _CREDENTIALS = struct.Struct("3i")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_CREDENTIALS.size)
 
@@ -48,8 +45,10 @@ class StopServer:
         self._dispatcher = dispatcher
         self._link: socket.socket | None = None
         self._stops = 0
-        self._latched_s = self._repeated_s = float("-inf")
-        """When STOP was latched, and when it was last carried out (monotonic)."""
+        self._repeated_s = float("-inf")
+        """When STOP was last carried out (monotonic)."""
+        self._beginning = False
+        """A STOP was passed to the session, which has not latched it yet: no state is from after it."""
         self._descriptor = -1
         self._said = self._page()
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="motion-page")
@@ -118,26 +117,20 @@ class StopServer:
     def _carry_out(self, sender: Peer) -> None:
         now_s = time.monotonic()
         self._stops += 1
+        moves = self._dispatcher.motion is ArmMotion.MOVES
         if not self._dispatcher.latched:
-            self._latched_s = now_s
-        elif not self._moves() and now_s - self._repeated_s < REPEAT_S:
+            self._beginning = True
+        elif not moves and now_s - self._repeated_s < REPEAT_S:
             return  # the next round updates the page
         self._repeated_s = now_s
         self._dispatcher.stop_by_datagram(sender)
         self._tell()
 
     def _page(self) -> Page:
-        return Page(os.getpid(), self._motion(), self._stops)
-
-    def _motion(self) -> ArmMotion:
-        if self._dispatcher.speed_rad_s is None:
-            return ArmMotion.UNKNOWN
-        just_stopped = time.monotonic() - self._latched_s < SETTLE_S
-        return ArmMotion.MOVES if self._moves() or just_stopped else ArmMotion.RESTS
-
-    def _moves(self) -> bool:
-        speed_rad_s = self._dispatcher.speed_rad_s
-        return speed_rad_s is not None and speed_rad_s > RESTING_RAD_S
+        if self._dispatcher.latched:
+            self._beginning = False
+        motion = ArmMotion.MOVES if self._beginning else self._dispatcher.motion
+        return Page(os.getpid(), motion, self._stops)
 
     def _tell(self) -> None:
         """Write the page if it changed, unless a write is still under way."""

@@ -232,6 +232,8 @@ class ApprovalManager:
 def require_start(joints_rad: Sequence[float], start_rad: Sequence[float], when: str) -> None:
     """Raise RefusedError when joints (6,) differ from `start_rad` by more than `START_TOLERANCE_RAD`."""
     moved_rad = float(np.abs(np.subtract(joints_rad, start_rad)).max())
-    if moved_rad > START_TOLERANCE_RAD:
-        advice, limit_rad = "Request the approval again.", START_TOLERANCE_RAD
-        raise RefusedError("arm-moved", when=when, moved_rad=moved_rad, limit_rad=limit_rad, advice=advice)
+    if not moved_rad <= START_TOLERANCE_RAD:  # nor is NaN where the arm stood
+        advice = "Request the approval again."
+        raise RefusedError(
+            "arm-moved", when=when, moved_rad=moved_rad, limit_rad=START_TOLERANCE_RAD, advice=advice
+        )

@@ -161,7 +161,7 @@ class Run:
             raise LimitError("path", listed="; ".join(map(str, check.problems)))
         now = (await self._context.ready_state()).joints_rad
         moved_rad = float(np.abs(np.subtract(now, here)).max())
-        if moved_rad > JOGGED_RAD:  # less may be settling
+        if not moved_rad <= JOGGED_RAD:  # less may be settling; NaN is nowhere
             when = "while its path was checked"
             raise LimitError("arm-moved", when=when, moved_rad=moved_rad, limit_rad=JOGGED_RAD, advice="")
         await self._mover.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)

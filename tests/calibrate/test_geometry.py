@@ -50,6 +50,14 @@ def test_inverse_and_quaternion_round_trip(t: np.ndarray, v: np.ndarray) -> None
     np.testing.assert_allclose(g.pose_from_quaternion(t, q), T, atol=1e-12)
 
 
+@pytest.mark.parametrize("wrong", [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0), (0.0, np.inf, 0.0, 1.0)])
+def test_what_is_no_rotation_does_not_become_the_identity(wrong: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="quaternion"):
+        g.matrix_from_quaternion(wrong)
+    with pytest.raises(ValueError, match="quaternion"):
+        g.pose_from_quaternion((0.0, 0.0, 0.0), [(0.0, 0.0, 0.0, 1.0), wrong])
+
+
 def test_quaternion_order_is_x_y_z_w() -> None:
     R = g.matrix_from_quaternion([0, 0, 2, 2])
     np.testing.assert_allclose(R @ [1, 0, 0], [0, 1, 0], atol=1e-12)

@@ -133,6 +133,10 @@ class Cell:
         await self.until(lambda state: max(map(abs, state["joint_speeds_rad_s"])) < AT_REST_RAD_S)
         await self._in_thread(rests_short_of_its_goal, self._admin)
 
+    async def stops_anywhere(self) -> None:
+        """Also where it had hardly begun, or was as good as there."""
+        await self.until(lambda state: not state["moving"] and state["program"] is None)
+
     async def strike(self, fault: Json | Callable[[Cell], object]) -> RobotError:
         """The fault in mid-move, asked of the controller or done. The arm stops before its goal; why."""
         move = await self.cruising()

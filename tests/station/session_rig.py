@@ -169,6 +169,9 @@ class ArmInMemory:
         self.log.append(f"stop by {way.value}")
         self._stopped.set()
 
+    def after_stop(self, state: RobotState) -> bool:
+        return True
+
     async def stop(self, reason: str) -> None:
         self.log.append("stop")
         self._stopped.set()

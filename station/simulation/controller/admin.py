@@ -54,6 +54,13 @@ def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None
         service.black_hole(on)
 
 
+def spoil(machine: Machine, outputs: list[str]) -> None:
+    """These outputs, such as "actual_q", are sent as NaN from now on; an empty list: none."""
+    if whole := [name for name in outputs if machine.robot.outputs.types[name] not in ("DOUBLE", "VECTOR6D")]:
+        raise ValueError(f"{', '.join(whole)} cannot be NaN")
+    machine.rtde.spoiled = tuple(outputs)
+
+
 def restart(
     machine: Machine, down_s: Annotated[float, Meta(ge=0, le=60)] = 1.0, running: bool = False
 ) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import struct
+from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
@@ -35,6 +37,8 @@ class RtdeServer:
         """Fault: connections stay open and are answered, but no states are sent."""
         self.frozen = False
         """Fault: the last state is sent again every cycle, its clock standing still."""
+        self.spoiled: tuple[str, ...] = ()
+        """Fault: names of the outputs that are sent as NaN."""
 
     def send_states(self) -> None:
         """Called once per cycle."""
@@ -136,13 +140,24 @@ class RtdeConnection(Connection):
         recipe = self._inputs[number - 1]
         self._robot.receive_inputs(recipe.names, recipe.unpack_elements(payload))
 
+    def _sent(self) -> Sequence[Any]:
+        """Elements of all outputs as they are sent: the robot's, but for those that are spoiled."""
+        elements = self._robot.outputs.elements
+        spoiled = self._server.spoiled
+        if not spoiled:
+            return elements
+        changed = list(elements)
+        for index in self._robot.outputs.indices(spoiled):
+            changed[index] = math.nan
+        return changed
+
     def send_state(self) -> None:
         server = self._server
         if not self._playing or server.stalled or self.service.silent or self._robot.ticks % self._every:
             return
         if not (server.frozen and self._last):
             assert self._output is not None
-            self._last = self._output.pack(self._elements(self._robot.outputs.elements)[:-1])
+            self._last = self._output.pack(self._elements(self._sent())[:-1])
         if self.transport.is_closing() or self.transport.get_write_buffer_size():
             return  # for a client that does not read nothing is queued
         self.transport.write(self._last)

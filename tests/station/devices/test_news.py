@@ -30,7 +30,8 @@ class Reader:
     """A connection whose newest state came so long ago; `unread`: what waits in the socket came just now."""
 
     def __init__(self, made: Any, age_s: float, *, unread: bool = False, ended: str | None = None) -> None:
-        self.ended, self.stands_still, self._unread, self._link = ended, False, unread, made
+        self.ended, self._unread, self._link = ended, unread, made
+        self.stands_still = self.not_finite = False
         self._come(age_s)
 
     def _come(self, age_s: float) -> None:

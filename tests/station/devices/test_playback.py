@@ -144,12 +144,23 @@ async def test_a_cell_plays_the_recorded_poses_and_can_reach_no_hardware(tmp_pat
     assert np.array_equal((await cell.camera.capture()).pixels, image(0)), "the arm stands at the first pose"
 
 
+ZEROS = b"camera_guess: {translation_m: [0, 0, 0], rotation_xyzw: [0, 0, 0, 0]}"
+"""A quaternion of zeros is no rotation, least of all the identity."""
+
+
 @pytest.mark.parametrize(
     ("how", "code"),
     [
         (None, "unreadable-recording"),
         ({"joints": True}, "no-config"),
         ({"joints": True, "config": b"robot: {arms: 3}"}, "no-config"),
+        (
+            {
+                "joints": True,
+                "config": b"camera_guess: {translation_m: [0, 0, 0], rotation_xyzw: [0, 0, 0, 0]}",
+            },
+            "no-config",  # a quaternion of zeros is no rotation, least of all the identity
+        ),
         ({"joints": False, "config": msgspec.yaml.encode(CONFIG)}, "no-joints"),
     ],
 )

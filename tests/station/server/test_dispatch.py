@@ -25,6 +25,7 @@ from station.cell.pose_plan import Plan
 from station.cell.socket_folder import user_name
 from station.cell.status import StationState
 from station.protocol.client import Client
+from station.protocol.stop_client import ArmMotion
 from station.server import dispatch
 from station.server.approval import ApprovalRule, Peer, Process, process
 from station.server.connections import ClientServer
@@ -337,7 +338,7 @@ async def test_stop_without_a_connection_is_named_by_the_persons_terminal(served
     dispatcher = SessionDispatcher(served.rig.session, at_a_terminal)
     assert not dispatcher.latched
     await dispatcher.stop_by_client(Peer(0, 5, os.getuid()))
-    assert dispatcher.latched and dispatcher.speed_rad_s == 0.0  # what `station stop` is told
+    assert dispatcher.latched and dispatcher.motion is ArmMotion.RESTS  # what `station stop` is told
     assert f"uid {os.getuid()} (pid 5)" in served.rig.session.store.status.reason  # it asked nothing before
     await served.rig.session.acknowledge("anna")
     dispatcher.stop_by_datagram(Peer(0, 5, os.getuid()))

@@ -53,10 +53,10 @@ ONLY_ROOT = pytest.mark.skipif(os.getuid() != 0, reason="only root can become so
 
 
 class Station(SessionDispatcher):
-    """A stop server without an arm; `speed_rad_s` is what the arm would say."""
+    """A stop server without an arm; `motion` is what the arm would say."""
 
     latched = False
-    speed_rad_s: float | None = 0.0
+    motion = ArmMotion.RESTS
 
     def __init__(self, control: Path) -> None:
         self.control = control
@@ -110,23 +110,27 @@ async def test_whatever_a_datagram_says_it_is_stop(station: Station, payload: by
     await until(lambda: station.heard)
 
 
-@pytest.mark.parametrize(("speed_rad_s", "outcome"), [(0.4, Outcome.MOVES), (None, Outcome.UNKNOWN)])
+@pytest.mark.parametrize(
+    ("motion", "outcome"), [(ArmMotion.MOVES, Outcome.MOVES), (ArmMotion.UNKNOWN, Outcome.UNKNOWN)]
+)
 async def test_an_arm_that_is_not_seen_to_rest_is_not_called_stopped(
-    station: Station, speed_rad_s: float | None, outcome: Outcome, monkeypatch: pytest.MonkeyPatch
+    station: Station, motion: ArmMotion, outcome: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("station.protocol.stop_client.REST_S", 0.2)
-    station.speed_rad_s = speed_rad_s
+    station.motion = motion
     assert await stopped(station.control) is outcome
     assert station.heard
 
 
-async def test_rest_is_not_believed_before_a_move_could_show(
+async def test_rest_is_not_believed_before_the_session_has_carried_stop_out(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The newest state may be of before a move that had just begun."""
-    monkeypatch.setattr(stop_server, "SETTLE_S", 60.0)
+    """The newest state is of before STOP, and a move may just have begun."""
     monkeypatch.setattr("station.protocol.stop_client.REST_S", 0.2)
+    monkeypatch.setattr(station, "stop_by_datagram", station.heard.append)  # it latches nothing yet
     assert await stopped(station.control) is Outcome.MOVES
+    station.latched = True
+    assert await stopped(station.control) is Outcome.RESTS
 
 
 async def test_of_a_flood_only_so_much_reaches_the_loop_and_another_stop_is_confirmed(

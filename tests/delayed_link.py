@@ -1,13 +1,21 @@
-"""A network between the station and a controller, in which everything takes its time, both ways."""
+"""A network between the station and a controller, in which everything takes its time, both ways.
+
+`python -m tests.delayed_link HOST DELAY_S OWN_HOST PARENT_PID` is a process of its own, so that a busy station
+does not hold it up.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import os
-import threading
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from station.cell.child import start_child
+from station.cell.process import die_with_parent
+from tests.patience import PATIENCE_S
 
 PORTS = (29999, 30001, 30002, 30003, 30004)
 """Of a controller: dashboard, primary, secondary, real time, RTDE."""
@@ -16,43 +24,32 @@ PIECE_BYTES = 1 << 16
 
 @contextmanager
 def delayed_link(controller_host: str, delay_s: float) -> Iterator[str]:
-    """Give a loopback address at which the controller answers `delay_s` later, each way.
-
-    It works in a thread of its own, so that the station's event loop does not hold it up.
-    """
+    """Give a loopback address at which the controller answers `delay_s` later, each way."""
     first, second, third = os.urandom(3)
     host = f"127.{first % 254 + 1}.{second}.{third % 254 + 1}"
-    loop = asyncio.new_event_loop()
-    listening, ending = threading.Event(), asyncio.Event()
-
-    async def serve() -> None:
-        servers = [
-            await asyncio.start_server(_Link(controller_host, port, delay_s).serve, host, port)
-            for port in PORTS
-        ]
-        listening.set()
-        await ending.wait()
-        for server in servers:
-            server.close()
-        left = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in left:
-            task.cancel()
-        await asyncio.gather(*left, return_exceptions=True)
-
-    thread = threading.Thread(target=lambda: loop.run_until_complete(serve()), daemon=True)
-    thread.start()
-    assert listening.wait(60)
+    what = [controller_host, str(delay_s), host, str(os.getpid())]
+    link = start_child("delayed link", [sys.executable, "-m", "tests.delayed_link", *what], PATIENCE_S, None)
     try:
         yield host
     finally:
-        loop.call_soon_threadsafe(ending.set)
-        thread.join()
-        loop.close()
+        link.stop(10.0)
 
 
-class _Link:
+async def serve(controller_host: str, delay_s: float, host: str) -> None:
+    for port in PORTS:
+        await asyncio.start_server(Link(controller_host, port, delay_s).serve, host, port)
+    print('{"ready": true}', flush=True)
+    await asyncio.to_thread(sys.stdin.read)  # until the test ends
+    os._exit(0)
+
+
+class Link:
+    """One port: what a client sends comes to the controller's port later, and what that answers, too."""
+
     def __init__(self, host: str, port: int, delay_s: float) -> None:
-        self._host, self._port, self._delay_s = host, port, delay_s
+        self._host = host
+        self._port = port
+        self._delay_s = delay_s
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError):
@@ -78,3 +75,8 @@ class _Link:
                 under_way.put_nowait((loop.time() + self._delay_s, piece))
         under_way.put_nowait((loop.time() + self._delay_s, b""))
         await delivering
+
+
+if __name__ == "__main__":
+    die_with_parent(int(sys.argv[4]))
+    asyncio.run(serve(sys.argv[1], float(sys.argv[2]), sys.argv[3]))

@@ -100,7 +100,8 @@ READ_DIRECTLY = {
     "recordings/cli/lazy.py", "recordings/door.py", "calibrate/document.py",  # our own source
     "station/protocol/stop_client.py",  # the page, by a program that loads little
     # the kernel's files
-    "station/cell/process.py", "station/server/approval.py", "station/devices/discovery.py",
+    "station/cell/process.py", "station/server/approval.py", "station/server/control_group.py",
+    "station/devices/discovery.py",
     "station/devices/aravis_device.py", "station/devices/posted.py",
     # files of the package
     "station/cli/requests.py", "station/simulation/controller/kinematics.py", "calibrate/report/html.py",

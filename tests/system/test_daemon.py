@@ -6,13 +6,16 @@ import asyncio
 import signal
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from recordings.reader import open_recording
+from recordings.recover import recover_recording
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
+from station.simulation.truth import write_truth
 from tests.patience import PATIENCE_S, until
-from tests.system.conftest import SystemRig, both_paths, go, status_when
+from tests.system.conftest import TRUTH, SystemRig, both_paths, go, status_when
 
 pytestmark = pytest.mark.process
 
@@ -43,6 +46,34 @@ async def test_a_killed_operator_stops_the_arm_and_stop_from_a_watcher_is_latche
             done = await status_when(cleo, lambda s: bool(s.session.recording))
         assert len(open_recording(Path(done.session.recording)).views()) == len(short_plan.poses)
     await anna.close()
+
+
+async def test_another_cells_daemon_on_the_same_folder_leaves_a_killed_ones_session_alone(
+    rig: SystemRig, short_plan: Plan
+) -> None:
+    first = await rig.daemon()
+    async with await first.client() as anna:
+        await go(anna, short_plan)
+        begun = await status_when(anna, lambda s: s.session.captured >= 1)
+        first.process.kill()
+        await rig.rests()
+    other_camera = msgspec.structs.replace(TRUTH, seed=6)  # its serial number follows the seed
+    write_truth(other_camera, rig.folder / "truth.json")
+    second = await rig.daemon()
+    async with await second.client() as bert:
+        status = await status_when(bert, lambda s: s.state is S.IDLE and s.camera.connected)
+        [told] = [event for event in status.events if event.code == "interrupted-elsewhere"]
+        assert told.values["what"] == "camera"
+        assert {told.values["first"], told.values["now"]} == {
+            f"MER-131-75GM SIM0000{seed}" for seed in (5, 6)
+        }
+        await go(bert, short_plan)
+        done = await status_when(bert, lambda s: bool(s.session.recording))
+    assert done.session.folder != begun.session.folder
+    recover_recording(Path(begun.session.folder))
+    for folder, seed in ((begun.session.folder, 5), (done.session.folder, 6)):
+        [segment] = open_recording(Path(folder)).segments
+        assert segment.info.camera_identity.serial == f"SIM0000{seed}"
 
 
 def children_of(pid: int) -> list[Path]:

@@ -7,6 +7,7 @@ import fcntl
 import os
 import re
 import stat
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -138,11 +139,18 @@ def rename_new(source: Path, target: Path) -> None:
     sync_folder(target.parent)
 
 
-def write_atomically(path: Path, content: bytes, mode: int = 0o640, like: Path | None = None) -> None:
+def write_atomically(
+    path: Path,
+    content: bytes,
+    mode: int = 0o640,
+    like: Path | None = None,
+    check: Callable[[Path], object] | None = None,
+) -> None:
     """The file is the old one or the new one, never half, also when several write it or the power fails.
 
     `mode`: its permissions, less the umask. `like`: a file whose permissions it gets instead, and its owner
-    where that is permitted. OSError as it comes; nothing is left beside the file then. A device or a pipe is
+    where that is permitted. `check`: reads the new file before it takes the old one's place, and raises what
+    keeps the old one there. OSError as it comes; nothing is left beside the file then. A device or a pipe is
     never replaced.
     """
     if path.exists() and not path.is_file():
@@ -158,9 +166,11 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o640, like: Path |
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
+        if check is not None:
+            check(temporary)
         temporary.rename(path)
         sync_folder(path.parent)
-    except OSError:
+    except BaseException:
         temporary.unlink(missing_ok=True)
         raise
 

@@ -12,12 +12,24 @@ from typing import Any
 ORDERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """Control characters but for tab and line feed, marks that turn the direction of writing, and what Python
 makes of bytes that are no UTF-8."""
+DEVICE_TEXT_LIMIT = 200
 SIGN = "\N{REPLACEMENT CHARACTER}"
 
 
 def plain_text(text: str) -> str:
     """The same text with a sign in place of each order to the terminal."""
     return ORDERS.sub(SIGN, text)
+
+
+def device_text(text: str) -> str:
+    """What a device says of itself, without what no name needs: orders to the terminal, and space around it.
+
+    Fields of fixed length end in NUL bytes, and what a scanner read in a carriage return. Nothing is put in
+    their place, so that one device is named alike by whatever way it is asked. At most `DEVICE_TEXT_LIMIT`
+    letters.
+    """
+    line = text.replace("\t", " ").replace("\n", " ")
+    return ORDERS.sub("", line).strip()[:DEVICE_TEXT_LIMIT].strip()
 
 
 def plain_data(value: Any) -> Any:

@@ -253,13 +253,16 @@ class RecordingSegment:
             view = self._message(Topic.VIEW, address, View)
             if view.picture_sequence not in self._facts and not without_picture(view):
                 raise self._corrupt(Topic.VIEW, address, f"view {view.index} names an image that is lost")
-            if not all(
-                _is_rigid(T) for T in (view.base_from_flange, view.camera_from_board) if T is not None
-            ):
+            if not has_rigid_poses(view):
                 text = f"a pose of view {view.index} is no rigid transform"
                 raise self._corrupt(Topic.VIEW, address, text)
             views.append(msgspec.structs.replace(view, part=self.info.part))
         return views
+
+
+def has_rigid_poses(view: View) -> bool:
+    """Tell whether the poses of a view, as far as they are told, are rigid transforms."""
+    return all(_is_rigid(T) for T in (view.base_from_flange, view.camera_from_board) if T is not None)
 
 
 def _is_rigid(told: Matrix4) -> bool:

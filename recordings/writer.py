@@ -19,8 +19,10 @@ import msgspec
 from recordings.errors import RecordingError, disk_error, exists_error, recover_line, wrong_size_error
 from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
 from recordings.image_headers import ImageError, read_header
+from recordings.manifest import PARTS_LIMIT
+from recordings.mcap.ending import check_ending
 from recordings.mcap.output import OutputFile
-from recordings.mcap.records import with_crc
+from recordings.mcap.records import BadRecordError, with_crc
 from recordings.schema import viewing
 from recordings.schema.definitions import CHANNEL_RECORDS, FORMATS, SESSION_RECORDS, PictureFacts, encode
 from recordings.schema.messages import (
@@ -35,6 +37,7 @@ from recordings.schema.messages import (
     without_picture,
 )
 from recordings.schema.topics import Topic, schema_bytes, schema_name
+from recordings.segment import VIEWS_LIMIT, has_rigid_poses
 
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
 SHOWN_PERIOD_NS = 40_000_000
@@ -57,6 +60,8 @@ class RecordingWriter:
             raise RecordingError("recording-name", path=path)
         if not is_session_name(info.name):
             raise RecordingError("session-name", name=info.name)
+        if not 1 <= info.part <= PARTS_LIMIT:
+            raise RecordingError("too-many-segments", path=path, part=info.part, limit=PARTS_LIMIT)
         if os.path.lexists(path):
             raise exists_error(path)
         self.path = path
@@ -67,6 +72,7 @@ class RecordingWriter:
         self._channels: dict[Topic, int] = {}
         self._images: dict[int, int] = {}
         """Sequence → time in the file."""
+        self._views = 0
         self._shown_ns = 0
         """Time of the newest state that viewers get."""
         self._attachments: set[str] = set()
@@ -127,6 +133,11 @@ class RecordingWriter:
         """The image must have been recorded before: a view never points at nothing."""
         if view.picture_sequence not in self._images and not without_picture(view):
             raise RecordingError("no-image", path=self.path, view=view.index, image=view.picture_sequence)
+        if self._views == VIEWS_LIMIT:
+            raise RecordingError("too-many-views", path=self.path, limit=VIEWS_LIMIT)
+        if not has_rigid_poses(view):
+            raise RecordingError("view-not-rigid", path=self.path, view=view.index)
+        self._views += 1
         time_ns = self._time_ns(view.stamps, view.index)
         self._add(Topic.VIEW, encode(view), time_ns)
         if not self._shown_ns:  # imported, say: nothing else tells viewers where the flange is
@@ -201,10 +212,19 @@ class RecordingWriter:
                 os.posix_fadvise(self._file.descriptor, 0, surplus, os.POSIX_FADV_DONTNEED)
 
     def finish(self) -> Path:
-        """Finishes the file, renames it, and returns its final path."""
+        """Finishes the file, reads its end back, renames it, and returns its final path."""
         with self._disk():
             self._mcap.finish()
             os.fsync(self._file.descriptor)
+            try:
+                check_ending(self._file.descriptor)
+            except BadRecordError as problem:
+                self.close()
+                rescue = recover_line(self.part_path)
+                self.error = RecordingError(
+                    "unreadable-end", path=self.part_path, reason=str(problem), rescue=rescue
+                )
+                raise self.error from problem
             rename_new(self.part_path, self.path)
         self.close()
         return self.path

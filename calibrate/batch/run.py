@@ -17,7 +17,7 @@ from calibrate.arm_table import FramePose
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.document import solver_software
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Sigma, encode_calibration, write_output
+from calibrate.files.calibration import Sigma, encode_calibration, write_encoded
 from calibrate.files.integrity import content_sha256
 from calibrate.files.lines import append_line, read_lines
 from calibrate.job import JobOptions, solve_recording
@@ -86,7 +86,7 @@ def run_batch(
                 said = {"recording": plain_text(recording), "error": plain_text(result.error)}
                 result = msgspec.structs.replace(result, **said)
                 if content:
-                    write_output(output / result.calibration, content)
+                    write_encoded(output / result.calibration, content)
                 done[key] = result
                 append_line(output / RESULTS, result)
                 if progress:

@@ -7,6 +7,7 @@ otherwise; covariances are of `geometry.perturb`'s delta.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,6 +39,7 @@ from calibrate.results import (
     Remark,
 )
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
+from recordings.plain_text import plain_data
 from recordings.schema.messages import (
     BoardSpec,
     CameraIdentity,
@@ -214,7 +216,9 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
 
 def encode_calibration(calibration: Calibration) -> bytes:
     """YAML text of the file, hash included."""
-    plain = msgspec.json.decode(msgspec.json.encode(calibration))
+    # Any text may come from a file name or a device. What the reader refuses is not written.
+    harmless = plain_data(msgspec.to_builtins(calibration))
+    plain = msgspec.json.decode(msgspec.json.encode(harmless))
     # The hash comes first so that people see it.
     head = {"format": plain.pop("format"), "sha256": "", "created": plain.pop("created")}
     ordered = head | plain
@@ -253,14 +257,32 @@ def read_calibration(path: Path | str) -> Calibration:
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
-    """Write the file atomically and durably. Raises CalibrationFileError."""
-    write_output(Path(path), encode_calibration(calibration))
+    """Write the file atomically and durably, and read it before it takes the place of an older one.
+
+    Raises CalibrationFileError; then an older file is still there.
+    """
+    write_encoded(Path(path), encode_calibration(calibration))
 
 
-def write_output(path: Path, content: bytes) -> None:
-    """Write a file that a user named, atomically and durably. Raises CalibrationFileError."""
+def write_encoded(path: Path, content: bytes) -> None:
+    """Write what `encode_calibration` returned; see `write_calibration`."""
+
+    def check(written: Path) -> None:
+        try:
+            decode_calibration(read_bounded(written), str(path))
+        except CalibrationFileError as problem:
+            raise CalibrationFileError("unreadable-result", path=path, why=str(problem)) from problem
+
+    write_output(path, content, check)
+
+
+def write_output(path: Path, content: bytes, check: Callable[[Path], object] | None = None) -> None:
+    """Write a file that a user named, atomically and durably. Raises CalibrationFileError.
+
+    `check`: reads the new file before it takes the place of an older one.
+    """
     try:
-        write_atomically(path, content, ASKED_FOR)
+        write_atomically(path, content, ASKED_FOR, check=check)
     except OSError as problem:
         raise CalibrationFileError(
             path=path, why=f"cannot be written: {problem.strerror or problem}"

@@ -42,17 +42,18 @@ def append_to_log(folder: Path, entry: object, versions: Iterable[int]) -> None:
         raise OSError(errno.EMSGSIZE, "the reason is too long for the log", str(path))
     log = read_validity_log(folder)
     size_bytes = path.stat().st_size if path.exists() else 0
+    kept: list[bytes] | None = None
     if size_bytes > ROTATE_BYTES:
-        kept = _newest(folder, log, set(versions))
-        worth_it = sum(map(len, kept)) < size_bytes / 2
+        newest = _newest(folder, log, set(versions))
+        if log.is_of_before or sum(map(len, newest)) < size_bytes / 2:
+            kept = newest
+    elif log.is_of_before:
+        kept = [_sealed(one, log) for one in log_lines(folder)]
+    if kept is None:
+        _append(path, line)
     else:
-        kept = [_sealed(line, log) for line in log_lines(folder)]
-        worth_it = False
-    if worth_it or log.is_of_before:
         content = b"".join(one + b"\n" for one in (*kept, line))
         write_atomically(path, content, like=path)
-    else:
-        _append(path, line)
 
 
 def _sealed(line: LogLine, log: ValidityLog) -> bytes:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 
+from recordings.plain_text import device_text
+
 if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
     import numpy as np
     from numpy.typing import NDArray
@@ -74,7 +76,21 @@ LARGEST_TOLERANCE = 0.1
 LARGEST_FLATNESS_M = 0.05
 
 
-class RobotIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What a device says of itself. Its texts are made harmless wherever they come from.
+
+    Device, configuration, imported file or a recording of before: a calibration with a NUL byte in a serial
+    number was written, and could not be read again.
+    """
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            told = getattr(self, name)
+            if isinstance(told, str) and (harmless := device_text(told)) != told:
+                msgspec.structs.force_setattr(self, name, harmless)
+
+
+class RobotIdentity(_Device, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     model: str = "unknown"
     serial: str = ""
     controller_version: str = ""
@@ -102,7 +118,7 @@ class ArmKinematics(msgspec.Struct, frozen=True):
     theta_rad: Vector6
 
 
-class CameraIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class CameraIdentity(_Device, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     vendor: str = ""
     model: str = "unknown"
     serial: str = ""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from recordings.images import Pixels
+from recordings.plain_text import device_text
 from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
@@ -260,10 +261,10 @@ def _find(aravis: Any, wanted: str) -> str:
     exact, by_model, found = [], [], []
     for i in range(aravis.get_n_devices()):
         serial, address, identity, model = (
-            aravis.get_device_serial_nbr(i),
+            device_text(aravis.get_device_serial_nbr(i) or ""),
             aravis.get_device_address(i),
             str(aravis.get_device_id(i)),
-            aravis.get_device_model(i),
+            device_text(aravis.get_device_model(i) or ""),
         )
         if wanted in (serial, address, identity):
             exact.append(identity)

@@ -20,6 +20,8 @@ from pathlib import Path
 
 import msgspec
 
+from recordings.plain_text import device_text
+
 _PORT = 3956
 _DISCOVERY = struct.pack(">BBHHH", 0x42, 0x11, 0x0002, 0, 1)
 """Packet DISCOVERY_CMD with the flag that allows broadcast answers."""
@@ -182,6 +184,6 @@ def discover_usb(devices: Path = _DEVICES, nodes: Path = _NODES) -> list[UsbCame
 def kernel_text(file: Path) -> str:
     """Read a file of the kernel; empty where it is missing, as after unplugging."""
     try:
-        return file.read_text(errors="replace").strip()
+        return device_text(file.read_text(errors="replace"))
     except OSError:
         return ""

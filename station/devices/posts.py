@@ -57,7 +57,7 @@ def read_declaration(line: bytes) -> tuple[Declaration, Convention | None]:
     try:
         declared = _DECLARATION.decode(line)
         return declared, convention(declared.convention) if declared.convention else None
-    except (msgspec.DecodeError, ImportSourceError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, ImportSourceError) as error:
         raise RobotError("post-undeclared", reason=str(error)) from None
 
 
@@ -65,7 +65,7 @@ def read_post(line: bytes, written: Convention | None) -> tuple[Post, Vector6]:
     """Read a post; return it and its pose: x y z [m], rotation vector [rad]. StaleStateError: it is wrong."""
     try:
         post = _POST.decode(line)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StaleStateError("post-unreadable", reason=str(error)) from None
     if (largest := max(map(abs, post.joints_rad or ()), default=0.0)) > TURNS_RAD:
         raise StaleStateError("post-degrees", angle=largest)

@@ -10,6 +10,7 @@ import time
 from functools import reduce
 from typing import Any
 
+from recordings.plain_text import device_text
 from station.cell.config import TriggerConfig
 from station.cell.errors import TriggerError
 from station.devices.base import DeviceThread
@@ -101,7 +102,7 @@ class SerialTrigger:
             raise TriggerError("no-trigger-box", port=self._config.port, found=found)
         self._boot_id, count = self._status()
         self._count = self._first_count = count
-        return f"{product} {serial}"
+        return f"{product} {device_text(serial)}"
 
     def _fire(self) -> TriggerPulse:
         if not self._opened:

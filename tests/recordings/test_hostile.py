@@ -240,7 +240,11 @@ def test_messages_that_are_wrong_in_themselves_name_their_place(tmp_path: Path) 
     ],
     ids=["mirrored", "scaled", "last row", "no number", "3 by 3"],
 )
-def test_a_view_whose_pose_is_none_is_refused(tmp_path: Path, T: np.ndarray) -> None:
+def test_a_view_whose_pose_is_none_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, T: np.ndarray
+) -> None:
+    """From another writer; ours refuses it as well."""
+    monkeypatch.setattr("recordings.writer.has_rigid_poses", lambda view: True)
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.robot_state(make_state(0))  # else viewers would be shown the view's pose
         writer.image(make_picture(0))

@@ -141,7 +141,9 @@ def test_a_list_that_is_no_file_does_not_hang_its_reader(session: Path) -> None:
         open_recording(session)
 
 
-def test_a_part_number_is_bounded(tmp_path: Path) -> None:
+def test_a_part_number_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From another writer; ours refuses it as well."""
+    monkeypatch.setattr("recordings.writer.PARTS_LIMIT", 1_000_000_000)
     with RecordingWriter(tmp_path / "a.mcap", make_info(part=1_000_000_000)) as writer:
         writer.finish()
     with refused("contradiction"):

@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibrate.errors import UsageError
-from calibrate.files.exports.robot import Urdf, origin_of
+from calibrate.files.exports.robot import LARGEST, Urdf, origin_of
 from calibrate.files.integrity import read_bounded
 from calibrate.geometry import quaternion_from_matrix
 from recordings import strict_yaml
 from recordings.importers.frames import FrameTree
 from recordings.importers.messages import FrameMessage
 
+_SHOWN = 40
 _NO_TRANSFORMS = (
-    AttributeError, KeyError, TypeError, ValueError,
+    AttributeError, LookupError, OverflowError, RecursionError, TypeError, ValueError,
     expat.ExpatError, ElementTree.ParseError, strict_yaml.StrictYamlError,
 )  # fmt: skip
 
@@ -67,11 +68,24 @@ def _told(node: Any) -> Iterator[FrameMessage]:
     """Walk through plain data to every transform with a stamp."""
     if isinstance(node, dict) and "child_frame_id" in node:
         at, turn = node["transform"]["translation"], node["transform"]["rotation"]
-        numbers = [at[axis] for axis in "xyz"], [turn[axis] for axis in "xyzw"]
-        yield _frame(node["header"]["frame_id"], node["child_frame_id"], *numbers)
+        numbers = [_number(at[axis]) for axis in "xyz"], [_number(turn[axis]) for axis in "xyzw"]
+        yield _frame(_name(node["header"]["frame_id"]), _name(node["child_frame_id"]), *numbers)
     elif isinstance(node, (dict, list)):
         for below in node.values() if isinstance(node, dict) else node:
             yield from _told(below)
+
+
+def _name(told: Any) -> str:
+    """A frame's name; one that looks like a number to YAML is written in quotes."""
+    if not isinstance(told, str) or not told.strip("/ "):
+        raise ValueError(f"{str(told)[:_SHOWN]!r} is no name of a frame")
+    return told
+
+
+def _number(told: Any) -> float:
+    if isinstance(told, bool) or not isinstance(told, (int, float)) or not abs(told) <= LARGEST:
+        raise ValueError(f"{str(told)[:_SHOWN]!r} is no number of a pose")
+    return float(told)
 
 
 def _frame(parent: str, child: str, position_m: ArrayLike, rotation_xyzw: ArrayLike) -> FrameMessage:

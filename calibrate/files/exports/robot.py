@@ -41,6 +41,8 @@ _MAX_OFF_M, _MAX_OFF_RAD = 5e-3, 2e-2
 """Rms differences of flanges up to which a URDF is this arm: a maker's calibration of an arm is less, another
 arm of the same build is more."""
 _EXACT = 1e-12
+LARGEST = 1e9
+"""Of a number in a file of frames, metres or radians: more is no place in a cell, its square overflows."""
 
 
 def corrected_urdf(calibration: Calibration, frames: FrameNames, given: bytes) -> bytes:
@@ -60,7 +62,7 @@ def corrected_urdf(calibration: Calibration, frames: FrameNames, given: bytes) -
                 f"{min(taken)} is in it already: name others with --camera and --body, or --attach"
             )
         found, B, T = _recognise(list(_paths(robot, len(true.axes), frames)), arm)
-    except (ElementTree.ParseError, expat.ExpatError, KeyError, TypeError, ValueError) as problem:
+    except (ElementTree.ParseError, expat.ExpatError, LookupError, TypeError, ValueError) as problem:
         raise UsageError("urdf", why=str(problem)) from None
     origins, tip_from_flange = found.corrected(true.at(np.zeros(len(true.axes))), B, T)
     in_hand = calibration.mount == "eye-in-hand"
@@ -132,7 +134,7 @@ def _child(element: Element, tag: str) -> Element:
 
 def _three(element: Element, name: str, default: str = "0 0 0") -> Array:
     found = np.array([float(word) for word in element.get(name, default).split()])
-    if found.shape != (3,) or not np.isfinite(found).all():
+    if found.shape != (3,) or not np.abs(found).max() <= LARGEST:
         raise ValueError(f"{element.get(name)!r} is not three numbers")
     return found
 

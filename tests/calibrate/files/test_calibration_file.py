@@ -7,6 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from calibrate.errors import CalibrationFileError
 from calibrate.files.calibration import (
@@ -15,8 +17,16 @@ from calibrate.files.calibration import (
     read_calibration,
     write_calibration,
 )
-from calibrate.job import SolvedRecording
+from calibrate.files.install import install, installed_calibration
+from calibrate.job import SolvedRecording, solve_recording
+from recordings.plain_text import DEVICE_TEXT_LIMIT, device_text
+from recordings.reader import open_recording
+from recordings.schema.messages import CameraIdentity, RobotIdentity
+from tests.calibrate.sessions import Scene, write_session
 from tests.codes import raises
+
+CONTROLS = ["\0", "\r", "\x1b[31m", "\x9b2J", "\x85", "\x7f"]
+TURNS = ["\u200e", "\u200f", "\u202a", "\u202e", "\u2066", "\u2069"]
 
 
 def test_everything_reads_back_as_it_was(solved_real: SolvedRecording, tmp_path: Path) -> None:
@@ -99,3 +109,68 @@ def test_a_covariance_that_is_none_is_refused_even_with_a_right_hash(
     wrong = msgspec.structs.replace(good, covariance=tuple(tuple(line) for line in rows))
     with pytest.raises(CalibrationFileError):
         decode_calibration(encode_calibration(wrong), "x")
+
+
+# --- texts of devices ---
+@pytest.mark.parametrize("order", [*CONTROLS, *TURNS, "\ud800"])
+def test_a_device_that_orders_the_terminal_about_is_written_so_that_it_reads_back(
+    solved_real: SolvedRecording, tmp_path: Path, order: str
+) -> None:
+    good, told = solved_real.calibration, f" A{order}B{order}"
+    robot = RobotIdentity(model=told, serial=told, controller_version=told)
+    camera = CameraIdentity(vendor=told, model=told, serial=told, driver=told)
+    assert robot.serial == camera.model == device_text(told)
+    path = tmp_path / "cell.yaml"
+    write_calibration(msgspec.structs.replace(good, robot=robot, camera=camera), path)
+    found = read_calibration(path)
+    assert (found.robot, found.camera) == (robot, camera)
+    install(path, tmp_path / "s")
+    assert installed_calibration(tmp_path / "s").robot.serial == robot.serial
+
+
+def test_a_recording_of_before_with_such_a_device_solves_to_a_file_that_reads_back(
+    tmp_path: Path,
+) -> None:
+    """The recorder wrote what the device said; the recording stays as it is."""
+    robot, camera = RobotIdentity("UR10e", "1"), CameraIdentity(model="cam", serial="1")
+    for device in (robot, camera):
+        msgspec.structs.force_setattr(device, "serial", "SN\0\x1b\u202e7")
+    path = write_session(
+        tmp_path / "before.mcap", Scene(views=5), known_lens=True, robot=robot, camera_identity=camera
+    )
+    assert b"SN\\u0000\\u001b" in path.read_bytes()
+    assert open_recording(path).info.robot.serial == "SN7"
+    write_calibration(solve_recording(path).calibration, tmp_path / "cell.yaml")
+    found = read_calibration(tmp_path / "cell.yaml")
+    assert (found.robot.serial, found.camera.serial) == ("SN7", "SN7")
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.text())
+def test_whatever_a_device_says_of_itself_is_harmless_and_the_same_when_it_is_asked_again(told: str) -> None:
+    cleaned = device_text(told)
+    assert device_text(cleaned) == cleaned
+    assert len(cleaned) <= DEVICE_TEXT_LIMIT
+    assert RobotIdentity(serial=told) == RobotIdentity(serial=cleaned)
+    assert yaml.safe_load(yaml.safe_dump({"serial": cleaned}, allow_unicode=True))["serial"] == cleaned
+
+
+@settings(max_examples=60, deadline=None)
+@given(text=st.text(alphabet=st.characters(exclude_categories=["Cs"])))
+def test_any_other_text_is_written_so_that_it_reads_back(solved_real: SolvedRecording, text: str) -> None:
+    """Names of images come from a folder, and end in the file."""
+    good = msgspec.structs.replace(solved_real.calibration, posterior=None)
+    named = msgspec.structs.replace(good.provenance, recording=text)
+    decode_calibration(encode_calibration(msgspec.structs.replace(good, provenance=named)), "x")
+
+
+def test_what_cannot_be_read_again_is_an_error_and_the_old_file_stays(
+    solved_real: SolvedRecording, own_file: Path
+) -> None:
+    before = own_file.read_bytes()
+    sigma = msgspec.structs.replace(solved_real.calibration.sigma, translation_mm=float("nan"))
+    wrong = msgspec.structs.replace(solved_real.calibration, sigma=sigma)
+    with raises("unreadable-result", CalibrationFileError):
+        write_calibration(wrong, own_file)
+    assert own_file.read_bytes() == before
+    assert list(own_file.parent.iterdir()) == [own_file]

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports import FrameNames
 from calibrate.files.exports.drivers import fixed_frames
@@ -168,3 +169,39 @@ def test_what_would_give_a_frame_two_parents_or_no_lens_is_refused(
         with raises("no-fixed-frames") as refused:
             fixed_frames([tmp_path / "none"])
         assert len(refused.value.values["why"]) < 200, "never the file itself"
+
+
+MESSAGE = """transforms:
+- header: {stamp: {sec: 1, nanosec: 2}, frame_id: %s}
+  child_frame_id: %s
+  transform: {translation: {x: %s, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0, w: %s}}
+"""
+FOREIGN = [
+    "1" + "0" * 400, "1" + "0" * 5000, "true", "null", "[1]", "{a: 1}", "1e400", ".nan", ".inf", "-1e308",
+    "''", '"\\e"', "/",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("place", range(4))
+@pytest.mark.parametrize("value", FOREIGN)
+def test_any_value_in_a_driver_s_file_is_read_or_refused_by_its_code(
+    tmp_path: Path, value: str, place: int
+) -> None:
+    values = ["camera_link", "lens", "0.1", "1"]
+    values[place] = value
+    (tmp_path / "tf.yaml").write_text(MESSAGE % tuple(values))
+    with raises("no-fixed-frames", UsageError):
+        fixed_frames([tmp_path / "tf.yaml"])
+
+
+@pytest.mark.parametrize(
+    "value", ["1 2", "1e400 0 0", "9" * 5000 + " 0 0", "nan 0 0", "1e308 1e308 0", "a b c"]
+)
+@pytest.mark.parametrize("name", ["xyz", "rpy"])
+def test_any_number_of_a_driver_s_urdf_is_read_or_refused_by_its_code(
+    tmp_path: Path, value: str, name: str
+) -> None:
+    joint = f"<joint type='fixed'><parent link='a'/><child link='b'/><origin {name}='{value}'/></joint>"
+    (tmp_path / "driver.urdf").write_text(f"<robot>{joint}</robot>")
+    with raises("no-fixed-frames", UsageError):
+        fixed_frames([tmp_path / "driver.urdf"])

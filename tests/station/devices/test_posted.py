@@ -25,6 +25,7 @@ from station.cell.layout import flange_pose
 from station.cell.stillness import StillnessMonitor
 from station.devices import posted
 from station.devices.posted import PAUSE_S, PostedArm
+from station.devices.posts import read_declaration
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
 from tests.station.session_rig import memory_config
@@ -319,6 +320,21 @@ async def test_a_program_that_declares_another_source_or_arm_is_refused(
     poster.post()
     assert await poster.refused() == code
     assert trouble(arm) == "post-nobody"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"source": "live", "robot": "\xe4"}',
+        b"\xff\xfe{",
+        b"[" * 60_000,
+        b'{"source":"live","late_s":1e999}',
+    ],
+)
+def test_a_first_line_that_is_no_utf_8_or_no_json_is_refused_by_its_code(line: bytes) -> None:
+    """Latin-1, UTF-16, nested without end, a number that is none."""
+    with raises("post-undeclared", RobotError):
+        read_declaration(line)
 
 
 @pytest.mark.parametrize("line", [b"x" * 65536, b"{}\n" * 20_000, b"\n" * 65536])

@@ -145,6 +145,26 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
         open_recording(recording.path)
 
 
+async def test_the_segment_that_no_reader_takes_is_refused_before_a_move_and_the_session_still_finishes(
+    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = await new_rig()
+    await first.go_until_it_moves()
+    first.arm.arrive.set()
+    await first.until(S.WRITING)
+    await first.until(S.MOVING)
+    crash(first)
+    second = await new_rig(with_plan=False)
+    monkeypatch.setattr("recordings.writer.PARTS_LIMIT", 1)
+    second.session.take_lease(1, "anna")
+    await second.session.acknowledge("anna")
+    await second.go_until(S.PAUSED, purpose=Purpose.RESUME)
+    assert second.cause == "too-many-segments"
+    assert "move" not in second.arm.log
+    await second.session.finish(1)
+    assert [view.index for view in sealed(second).views()] == [0]
+
+
 async def test_a_lost_trigger_box_is_a_fault_of_the_session_until_the_next_go(rig: Rig) -> None:
     """The session's own devices in memory; the camera's box is gone at the first picture."""
     rig.camera.fail = [TriggerError()]

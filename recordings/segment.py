@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-import numpy as np
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Message
 
@@ -33,16 +32,14 @@ from recordings.schema.definitions import (
 from recordings.schema.messages import (
     CaptureEvent,
     Image,
-    Matrix4,
     RobotState,
     SessionInfo,
     View,
     without_picture,
 )
+from recordings.schema.rules import VIEWS_LIMIT, has_rigid_poses
 from recordings.schema.topics import Topic, parse, schema_bytes, schema_name
 
-VIEWS_LIMIT = 10_000
-_RIGID_TOLERANCE = 1e-6
 S = TypeVar("S", bound=msgspec.Struct)
 
 
@@ -258,18 +255,3 @@ class RecordingSegment:
                 raise self._corrupt(Topic.VIEW, address, text)
             views.append(msgspec.structs.replace(view, part=self.info.part))
         return views
-
-
-def has_rigid_poses(view: View) -> bool:
-    """Tell whether the poses of a view, as far as they are told, are rigid transforms."""
-    return all(_is_rigid(T) for T in (view.base_from_flange, view.camera_from_board) if T is not None)
-
-
-def _is_rigid(told: Matrix4) -> bool:
-    T = np.array([n for row in told for n in row])
-    if T.size != 16 or not np.isfinite(T).all():
-        return False
-    T = T.reshape(4, 4)
-    R = T[:3, :3]
-    orthonormal = np.abs(R @ R.T - np.eye(3)).max() < _RIGID_TOLERANCE and np.linalg.det(R) > 0
-    return bool(orthonormal and np.abs(T[3] - [0, 0, 0, 1]).max() < _RIGID_TOLERANCE)

@@ -36,8 +36,8 @@ from recordings.schema.messages import (
     View,
     without_picture,
 )
+from recordings.schema.rules import VIEWS_LIMIT, has_rigid_poses
 from recordings.schema.topics import Topic, schema_bytes, schema_name
-from recordings.segment import VIEWS_LIMIT, has_rigid_poses
 
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
 SHOWN_PERIOD_NS = 40_000_000

@@ -1,7 +1,7 @@
 """A network between the station and a controller, in which everything takes its time, both ways.
 
-`python -m tests.delayed_link HOST DELAY_S OWN_HOST PARENT_PID` is a process of its own: a busy station does not
-hold it up.
+`python -m tests.delayed_link HOST DELAY_S OWN_HOST PARENT_PID` is a process of its own, so that a busy
+station does not hold it up.
 """
 
 from __future__ import annotations

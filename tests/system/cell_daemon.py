@@ -3,6 +3,7 @@
 `station serve --simulate` owns its controller, which ends with it; here a test can look at the arm of a
 daemon that was killed. CELL_CONTROL: what drives the arm.
 CELL_SOURCE: `real` lets only approve whom a real arm's daemon would, of the simulated arm all the same.
+CELL_SERVICE: the user whose programs may approve by the hash.
 CELL_HANGS: `camera` or `disk` hangs for ever, from the second image or the first view on.
 """
 
@@ -63,7 +64,9 @@ def main() -> None:
     config = cell_config(truth, host)
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1)
     robot = msgspec.structs.replace(config.robot, control=os.environ.get("CELL_CONTROL"))
-    config = msgspec.structs.replace(config, capture=capture, robot=robot)
+    services = tuple(filter(None, [os.environ.get("CELL_SERVICE")]))
+    approval = msgspec.structs.replace(config.approval, services=services)
+    config = msgspec.structs.replace(config, capture=capture, robot=robot, approval=approval)
     place, hangs = Path(root), os.environ.get("CELL_HANGS", "")
     if hangs == "disk":
         let_the_disk_hang()

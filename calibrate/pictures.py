@@ -29,9 +29,9 @@ from calibrate.views import BoardView, ViewSet, array_of, require_size
 from recordings.errors import ImportSourceError
 from recordings.files import usable_cores
 from recordings.importers import conventions
-from recordings.importers.dataset import DATASET_FILE, read_dataset, read_poses
+from recordings.importers.dataset import DATASET_FILE, read_dataset
 from recordings.importers.folder import read_image
-from recordings.importers.tables import look
+from recordings.importers.reader import look, read_described
 from recordings.reader import Pictures
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 
@@ -61,12 +61,13 @@ def read_folder(
     folder = Path(folder)
     if not folder.is_dir():
         raise ImportSourceError("no-folder", path=folder)
-    known = read_dataset(folder / DATASET_FILE)[0] if (folder / DATASET_FILE).is_file() else None
-    if is_described(folder, board, mount, convention, poses) and known is not None:
-        rows = read_poses(folder)[0]
+    if is_described(folder, board, mount, convention, poses):
+        described = read_described(folder)
+        known, rows = described.dataset, described.rows
     else:
+        told = read_dataset(folder / DATASET_FILE)[0] if (folder / DATASET_FILE).is_file() else None
         given = Given(convention, mount, None if board is None else _board(board))
-        believed = believe(look(folder, None if poses is None else Path(poses)), given, known)
+        believed = believe(look(folder, None if poses is None else Path(poses)), given, told)
         known, rows = believed.dataset, believed.rows
     if any(row.camera_from_board is not None for row in rows):
         raise ImportSourceError("pairs-only", path=folder)

@@ -23,9 +23,10 @@ from recordings.importers.bags import BAGS, UNFINISHED
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
 from recordings.importers.folder import Imported, import_folder, write_views
 from recordings.importers.messages import Progress
+from recordings.importers.reader import look
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import StandstillLimits
-from recordings.importers.tables import Contents, look
+from recordings.importers.tables import Contents
 from recordings.plain_text import plain_text
 from recordings.schema.messages import Mount
 from recordings.schema.stillness import POSITION_M, ROTATION_RAD

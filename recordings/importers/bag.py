@@ -1,34 +1,25 @@
-"""A ROS bag, or any MCAP with images and poses → a recording like the station's own.
-
-A first pass reads frames, joints and the images' stamps, finds the stops of the arm and pairs each with
-its last image; a second one reads those images and the joints, and writes. One image is in memory at a
-time.
-"""
+"""A ROS bag, or any MCAP with images and poses → a recording like the station's own."""
 
 from __future__ import annotations
 
-from itertools import chain
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from recordings.errors import ImportSourceError, wrong_size_error
-from recordings.image_headers import KEPT_FORMATS, ImageError, read_header
-from recordings.images import Pixels, decode_image, encode_png, pixel_format_of, raw_array
-from recordings.importers.bags import open_bag
-from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
+from recordings.images import Pixels
+from recordings.importers.dataset import DATASET_FILE
 from recordings.importers.folder import Imported
-from recordings.importers.messages import ImageMessage, Progress
-from recordings.importers.selection import Selection, Wanted, select
-from recordings.importers.stops import Standstill, StandstillLimits, StopFinder
-from recordings.schema.messages import CameraModel, Image, Joints, Matrix4, RobotState, Stamps, Vector6, View
-from recordings.schema.viewing import matrix_of
+from recordings.importers.messages import Progress
+from recordings.importers.reader import Frame, read_bag, unexpected
+from recordings.importers.reader_messages import BagRead, SessionRead, StatesRead, ViewRead
+from recordings.importers.selection import Wanted
+from recordings.importers.stops import StandstillLimits
+from recordings.schema.messages import Image
 from recordings.writer import RecordingWriter, derived_recording
 
 PAIR_WITHIN_S = 0.05
-STOPS_LEAST = 3
 
 
 def import_bag(
@@ -42,125 +33,58 @@ def import_bag(
 ) -> Imported:
     """`output` None: says what would be taken and writes nothing. Raises ImportSourceError or RecordingError.
 
-    `description`: a dataset.yaml with mount and board (default: the one in or beside the source).
+    `description`: a dataset.yaml with mount and board (default: the one in or beside the source). The bag is
+    read in a process of its own.
     """
-    bag = open_bag(source, progress)  # what is wrong with the source comes before what it lacks
-    try:
-        described, description_bytes = _description(source, description, needed=output is not None)
-        chosen = select(bag, wanted)
-        images_ns = np.fromiter((image.stamp_ns for image in bag.images(chosen.image.name)), np.int64)
-        joints = chosen.joints
-        speeds = None
-        if joints is not None and joints.speeds_rad_s is not None:
-            speeds = joints.stamps_ns, np.abs(joints.speeds_rad_s).max(axis=1)
-        finder = StopFinder(chosen.track, images_ns, speeds, pair_within_s)
-        stops, passed = finder.stops(limits)
-        why = ", ".join(f"{count} {reason}" for reason, count in passed.items() if count)
-        bound_ms = 1e3 * max((stop.bound_s for stop in stops), default=0.0)
-        known = (described and described.camera) or chosen.camera
-        lens = "intrinsics known" if known and known.matrix else "intrinsics to be estimated"
-        facts = {
-            "images": (f"{len(images_ns)} {chosen.image.name}", lens),
-            "poses": (chosen.poses_from, f"paired by stamp within {bound_ms:.2f} ms"),
-            "joints": (joints.topic if joints else "none of an arm of five to seven", ""),
-            "stops": (str(len(stops)), f"images passed over: {why or 'none'}"),
-            "not used": (", ".join(bag.others) or "nothing", ""),
-        }
+    views = output is not None
+    with read_bag(source, description, wanted, limits, pair_within_s, views, progress) as answers:
+        bag, _ = next(answers, (None, []))
+        if not isinstance(bag, BagRead):
+            raise unexpected(source)
         if output is None:
-            if wider := finder.wider(limits):
-                still_mm, still_deg = 1e3 * wider[0].position_m, np.degrees(wider[0].rotation_rad)
-                flags = f"--still-mm {still_mm:.2g} --still-deg {still_deg:.2g}"
-                facts["wider"] = flags, f"gives {wider[1]} stops"
-            return Imported(source, len(stops), facts)
-        if len(stops) < STOPS_LEAST:
-            counts = {"stops": len(stops), "images": len(images_ns), "limit": STOPS_LEAST}
-            raise ImportSourceError("no-stops", source=source, passed_over=why, **counts)
-        assert described is not None
-        images = bag.images(chosen.image.name, {stop.place for stop in stops})
-        first = next(images)
-        camera = _camera(described, chosen.camera, _pixels(first, min(stop.place for stop in stops))[0])
-        note = f"imported from {source.name}: {chosen.image.name}, {chosen.poses_from}"
-        info = described.session(source, camera, max(0, min(stop.stamp_ns for stop in stops)), note)
-        with derived_recording(output, info) as writer:
-            writer.attach(DATASET_FILE, "application/yaml", description_bytes)
-            writer.attach("import.json", "application/json", msgspec.json.encode(facts))
-            _write_states(writer, chosen)
-            in_file_order = sorted(enumerate(stops), key=lambda numbered: numbered[1].place)
-            pairs = zip(in_file_order, chain([first], images), strict=True)
-            for done, ((index, stop), image) in enumerate(pairs, 1):
-                at_stop = joints.at(stop.stamp_ns, pair_within_s) if joints else None
-                _write_view(writer, index, stop, image, at_stop)
-                progress(done, len(stops), "importing")
-            return Imported(writer.finish(), len(stops), facts)
-    finally:
-        bag.close()
+            return Imported(source, bag.stops, bag.facts)
+        session, attached = next(answers, (None, []))
+        if not isinstance(session, SessionRead) or len(attached) != 1:
+            raise unexpected(source)
+        with derived_recording(output, session.info) as writer:
+            writer.attach(DATASET_FILE, "application/yaml", attached[0])
+            writer.attach("import.json", "application/json", msgspec.json.encode(bag.facts))
+            _write(writer, source, answers, bag.stops, progress)
+            return Imported(writer.finish(), bag.stops, bag.facts)
 
 
-def _description(source: Path, given: Path | None, needed: bool) -> tuple[Dataset | None, bytes]:
-    folder = source if source.is_dir() else source.parent
-    for path in (given, folder / DATASET_FILE, folder.parent / DATASET_FILE):
-        if path is not None and (path == given or path.is_file()):
-            return read_dataset(path)
-    if needed:
-        raise ImportSourceError("no-dataset", source=source)
-    return None, b""
-
-
-def _camera(described: Dataset, found: CameraModel | None, first: Pixels) -> CameraModel:
-    """The description's, else the bag's, else the size alone. ImportSourceError for another size."""
-    height, width = first.shape[:2]
-    camera = described.camera or found or CameraModel(width, height)
-    if (camera.width, camera.height) != (width, height):
-        raise wrong_size_error("The first image", (width, height), (camera.width, camera.height))
-    return camera
-
-
-def _write_states(writer: RecordingWriter, chosen: Selection) -> None:
-    """Robot states from the joints, the arm's tool as dataset.yaml tells it."""
-    joints = chosen.joints
-    if joints is None:
-        return
-    T = chosen.track.at(joints.stamps_ns) @ matrix_of(writer.info.robot.tcp_offset)
-    poses = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_rotvec()]).tolist()
-    speeds = [()] * len(poses) if joints.speeds_rad_s is None else joints.speeds_rad_s.tolist()
-    for stamp_ns, at, moving, pose in zip(
-        joints.stamps_ns.tolist(), joints.positions_rad.tolist(), speeds, poses, strict=True
-    ):
-        stamps = Stamps(stamp_ns, stamp_ns, controller_s=stamp_ns / 1e9)
-        tcp_pose = msgspec.convert(pose, Vector6)
-        writer.robot_state(RobotState(stamps, tuple(at), tuple(moving), tuple(at), tcp_pose))
-
-
-def _write_view(
-    writer: RecordingWriter, index: int, stop: Standstill, message: ImageMessage, joints_rad: Joints | None
+def _write(
+    writer: RecordingWriter, source: Path, answers: Iterator[Frame], stops: int, progress: Progress
 ) -> None:
-    pixels, encoded = _pixels(message, stop.place)
-    stamps = Stamps(stop.stamp_ns, stop.stamp_ns, device_ns=stop.stamp_ns)
-    pixel_format = pixel_format_of(pixels, message.encoding)
-    image = Image(pixels, stamps, stop.place, index, pixel_format=pixel_format)
-    writer.image(image, encoded)
-    T: Matrix4 = tuple(tuple(map(float, row)) for row in stop.base_from_flange)
-    writer.view(
-        View(
-            index=index,
-            name=f"stop-{index + 1}",
-            picture_sequence=index,
-            base_from_flange=T,
-            joints_rad=joints_rad,
-            stamps=stamps,
-            time_bound_s=stop.bound_s,
-            stillness=stop.stillness,
-        )
-    )
+    """Write states and views as they come. RecordingError where they are not those of so many stops."""
+    done = 0
+    for answer, blobs in answers:
+        match answer:
+            case StatesRead():
+                for state in answer.states:
+                    writer.robot_state(state)
+            case ViewRead():
+                pixels = _pixels(answer, blobs, source)
+                view = answer.view
+                place = view.picture_sequence
+                image = Image(pixels, answer.stamps, place, place, pixel_format=answer.pixel_format)
+                writer.image(image, None if answer.raw else blobs[1])
+                writer.view(view)
+                done += 1
+                progress(done, stops, "importing")
+            case _:
+                raise unexpected(source)
+    if done != stops:
+        raise unexpected(source)
 
 
-def _pixels(image: ImageMessage, place: int) -> tuple[Pixels, bytes | None]:
-    """(array as recordings hold it, file bytes to keep). ImportSourceError for what no camera here writes."""
+def _pixels(answer: ViewRead, blobs: list[bytes], source: Path) -> Pixels:
+    """The array of an image. RecordingError where its bytes are not of its shape."""
+    if len(blobs) != (1 if answer.raw else 2):
+        raise unexpected(source)
     try:
-        if image.width:
-            return raw_array(image.data, image.encoding, image.width, image.height, image.step), None
-        header = read_header(image.data)
-        decoded = decode_image(image.data, header.width, header.height)
-        return decoded, image.data if header.format in KEPT_FORMATS else encode_png(decoded)
-    except ImageError as error:
-        raise ImportSourceError("bad-image", place="the bag", image=place + 1, reason=str(error)) from error
+        if answer.deep:
+            return np.frombuffer(blobs[0], np.uint16).reshape(answer.shape)
+        return np.frombuffer(blobs[0], np.uint8).reshape(answer.shape)
+    except ValueError as error:
+        raise unexpected(source) from error

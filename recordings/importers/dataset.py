@@ -7,13 +7,12 @@ import errno
 import io
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings import strict_yaml
 from recordings.errors import ImportSourceError, disk_error
@@ -73,6 +72,8 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     def session(self, source: Path, camera: CameraModel, created_ns: int = 0, note: str = "") -> SessionInfo:
         """Description of a recording made from `source`; `note` where dataset.yaml has none."""
+        from importlib.metadata import version  # a reader's process need not wait for it
+
         robot = self.robot
         return SessionInfo(
             name=session_name_from(source.resolve().name if source.is_dir() else source.stem),
@@ -151,8 +152,39 @@ def read_small_file(path: Path, limit_bytes: int) -> bytes:
         raise ImportSourceError("file-too-large", path=path, reason=error.strerror) from error
 
 
+@dataclass(frozen=True)
+class PoseLine:
+    """One line of poses.csv, as it is written."""
+
+    line: int
+    image: str
+    position_m: tuple[float, float, float]
+    rotation_xyzw: tuple[float, float, float, float]
+    """Of length 1 but for its last digits."""
+    joints_rad: Joints | None
+
+
+def pose_rows(lines: Sequence[PoseLine]) -> list[PoseRow]:
+    """The rows' poses as matrices."""
+    from scipy.spatial.transform import Rotation  # a reader's process, which only reads, need not wait for it
+
+    T = np.broadcast_to(np.eye(4), (len(lines), 4, 4)).copy()
+    T[:, :3, :3] = Rotation.from_quat([line.rotation_xyzw for line in lines]).as_matrix()
+    T[:, :3, 3] = [line.position_m for line in lines]
+    return [
+        PoseRow(line.line, line.image, tuple(map(tuple, matrix)), line.joints_rad)
+        for line, matrix in zip(lines, T.tolist(), strict=True)
+    ]
+
+
 def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
-    """(rows, the file's bytes). Raises ImportSourceError; values `line` and what is wrong there."""
+    """(rows, the file's bytes) of a folder of one's own, read in this process. Raises ImportSourceError."""
+    lines, content = read_pose_lines(folder)
+    return pose_rows(lines), content
+
+
+def read_pose_lines(folder: Path) -> tuple[list[PoseLine], bytes]:
+    """(lines, the file's bytes). Raises ImportSourceError; values `line` and what is wrong there."""
     path = folder / POSES_FILE
     content = read_small_file(path, _CSV_LIMIT_BYTES)
     try:
@@ -169,7 +201,7 @@ def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
         found = ",".join(lines[0][1])[:100] if lines else "nothing"
         needed = f"'{','.join(HEADER)}' (metres, unit quaternion), perhaps with ,j1 … j6 (radians)"
         raise ImportSourceError("header", path=path, line=1, found=found, needed=needed)
-    rows = [_pose_row(path, line, header, [cell.strip() for cell in cells]) for line, cells in lines[1:]]
+    rows = [_pose_line(path, line, header, [cell.strip() for cell in cells]) for line, cells in lines[1:]]
     if not rows:
         raise ImportSourceError("no-poses", path=path, line=1)
     first: dict[str, int] = {}
@@ -179,7 +211,7 @@ def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
     return rows, content
 
 
-def _pose_row(path: Path, line: int, header: list[str], cells: list[str]) -> PoseRow:
+def _pose_line(path: Path, line: int, header: list[str], cells: list[str]) -> PoseLine:
     if len(cells) != len(header):
         reason = f"{len(cells)} values where {len(header)} are needed ({','.join(header)})"
         raise ImportSourceError("pose-row", path=path, line=line, reason=reason)
@@ -205,6 +237,6 @@ def _pose_row(path: Path, line: int, header: list[str], cells: list[str]) -> Pos
         raise ImportSourceError("no-unit-quaternion", path=path, line=line, length=length)
     if joints and (turn := max(map(abs, joints))) > _TURN_LIMIT_RAD:
         raise ImportSourceError("not-radians", path=path, line=line, turn=turn)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
-    return PoseRow(line, cells[0], tuple(map(tuple, T.tolist())), tuple(joints) or None)
+    x, y, z = position
+    qx, qy, qz, qw = quaternion
+    return PoseLine(line, cells[0], (x, y, z), (qx, qy, qz, qw), tuple(joints) or None)

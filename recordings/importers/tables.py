@@ -9,21 +9,33 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from recordings.files import read_beginning
 from recordings.image_headers import LFS_POINTER
-from recordings.importers.messages import Array
-from recordings.importers.trees import IMAGE, IMAGE_SUFFIXES, POSE_SIZES, read_tree
+from recordings.importers.trees import IMAGE, IMAGE_SUFFIXES, POSE_SIZES, UnreadableArraysError, read_tree
+
+if TYPE_CHECKING:  # messages of bags load more than a folder needs
+    from recordings.importers.messages import Array
 
 _FILES_LIMIT = 5000
+_FOLDERS_LIMIT = 5000
+_VALUES_LIMIT = 200_000
+"""Values and brackets of one file."""
+_NUMBER_LIMIT = 1e6
+"""No arm is a kilometre long, in whatever unit."""
+_TEXT_LIMIT = 200
+"""Letters of a key or a text that are looked at: poses and boards are described in fewer."""
+_DIGITS_LIMIT = 18
+"""Digits of a running number; Python itself refuses those of some thousands."""
+_WORDS_LIMIT = 20_000
 _UNREAD = {
     "to be unpacked first": (".zip", ".tar", ".tgz", ".gz", ".7z", ".rar"),
     "to be saved as CSV first": (".xlsx", ".xls", ".ods", ".pkl", ".pickle"),
@@ -108,16 +120,22 @@ class _Row:
     told: bool
 
 
-def look(source: Path, poses: Path | None = None) -> Contents:
-    """Read what lies in a folder, or one file.
+def look(
+    source: Path, poses: Path | None = None, reading: Callable[[Path], None] = lambda path: None
+) -> Contents:
+    """Read what lies in a folder, or one file, in this process: imports call `reader.look`.
 
-    `poses` tells the robot's: a file, a folder or the end of their names.
+    `poses` tells the robot's: a file, a folder or the end of their names. `reading` is told each file before
+    it is read.
     """
     root = source if source.is_dir() else source.parent
     file = poses if poses is None or poses.exists() else root / poses
     found, words = Contents(root, told=None if poses is None else []), ["/".join(source.resolve().parts[-3:])]
     rows = defaultdict[tuple[str, ...], list[_Row]](list)
-    files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
+    files = list(islice(_files(source, found.unread), _FILES_LIMIT + 1))
+    if len(files) > _FILES_LIMIT:
+        found.unread[f"more than {_FILES_LIMIT} files"] = "those that are needed to be put elsewhere first"
+    files = sorted(files[:_FILES_LIMIT], key=natural)
     for path in files if file is None or file.is_relative_to(root) else [*files, file]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
             alike = str(path.relative_to(root).parent / _pattern(path.name))
@@ -128,30 +146,45 @@ def look(source: Path, poses: Path | None = None) -> Contents:
             todo = "to be fetched first with `git lfs pull`"
         if todo:
             found.unread[path.name] = todo
-        tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
-        if tree is None:
+        if path.name.startswith((".", "README", "CMake")):
+            continue
+        reading(path)
+        try:
+            nodes = list(islice(_nodes(read_tree(path), (), ""), _VALUES_LIMIT + 1))
+        except UnreadableArraysError as problem:
+            found.unread[path.name] = f"to be saved as CSV first ({problem})"
+            continue
+        except RecursionError:
+            found.unread[path.name] = "to be saved as CSV first (nested too deeply)"
+            continue
+        if len(nodes) > _VALUES_LIMIT:
+            found.unread[path.name] = f"to be shortened first: more than {_VALUES_LIMIT} values"
+            continue
+        if not nodes:
             continue
         name = str(path.relative_to(root)) if path.is_relative_to(root) else path.name
         words.append(name)
         told = defaultdict[tuple[str, ...], list[_Row]](list)
-        for node in _nodes(tree, (), ""):
+        for node in nodes:
             _facts(node, found)
             words.extend(node.keys[-1:])
             if isinstance(node.value, str):
                 words.append(node.value[:60])
             if (row := _pose(node.value) or _half(node)) is not None:
                 numbers, rotation, half = row
-                place = (*map(int, re.findall(r"\d+", name)), *node.place)
+                place = (*_numbers_in(name), *node.place)
                 key = ".".join(node.keys), rotation, half, str(len(numbers))
                 told[key].append(_Row(numbers, node.image, place, file in (path, *path.parents)))
         for (named, *form), each in told.items():  # files of one row each make a table together
             rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
+    words = words[:_WORDS_LIMIT]
     words += [re.sub("[- ]", "_", word) for word in words]
     found.words = " ".join(dict.fromkeys(words))
     for name, rotation, each in _joined(rows):
         for part, some in _two_by_two(each).items():
             table = _without_count(np.array([row.numbers for row in some]))
-            if len(some) >= 3 and table.shape[1] in (6, 7, 12, 16):
+            poses_alike = table.shape[1] in (6, 7, 12, 16) and float(np.abs(table).max()) <= _NUMBER_LIMIT
+            if len(some) >= 3 and poses_alike:
                 beside = [row.image for row in some], [row.place for row in some]
                 found.tables.append(Table(f"{name}{part}", rotation, table, *beside))
                 if found.told is not None and (some[0].told or f"{name}{part}".endswith(str(poses))):
@@ -195,15 +228,31 @@ def _two_by_two(rows: list[_Row]) -> dict[str, list[_Row]]:
     return {"": rows}
 
 
-def _files(source: Path) -> Iterator[Path]:
-    """All files, also below folders that are links; each folder once."""
+def _files(source: Path, unread: dict[str, str]) -> Iterator[Path]:
+    """All files, also below folders that are links; each once. Links that leave `source` are `unread`."""
     if source.is_file():
         yield source
-    been = {os.path.realpath(source)}
+    root = os.path.realpath(source)
+    been = {root}
+
+    def is_inside(path: Path) -> bool:
+        if not path.is_symlink() or Path(os.path.realpath(path)).is_relative_to(root):
+            return True
+        unread[path.name] = "to be copied here first: a link that leaves the folder"
+        return False
+
     for folder, below, names in os.walk(source, followlinks=True):
-        below[:] = sorted(name for name in below if os.path.realpath(Path(folder, name)) not in been)
-        been.update(os.path.realpath(Path(folder, name)) for name in below)
-        yield from (path for name in sorted(names) if (path := Path(folder, name)).is_file())
+        paths = [Path(folder, name) for name in sorted(below)]
+        new = {os.path.realpath(path): path.name for path in paths if is_inside(path)}
+        below[:] = [name for real, name in new.items() if real not in been]
+        been.update(new)
+        if len(been) > _FOLDERS_LIMIT:
+            unread[f"more than {_FOLDERS_LIMIT} folders"] = "those that are needed to be put into one first"
+            return
+        for name in sorted(names):
+            path = Path(folder, name)
+            if is_inside(path) and path.is_file():
+                yield path
 
 
 def _is_pointer(path: Path) -> bool:
@@ -215,6 +264,10 @@ def _is_pointer(path: Path) -> bool:
 def natural(path: Path | str) -> list[Any]:
     """Sort key by which 2 comes before 10."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(path))]
+
+
+def _numbers_in(text: str) -> tuple[int, ...]:
+    return tuple(int(digits[-_DIGITS_LIMIT:]) for digits in re.findall(r"\d+", text))
 
 
 def _pattern(path: Path | str) -> str:
@@ -238,8 +291,8 @@ def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] 
         named = next((v for v in tree.values() if isinstance(v, str) and IMAGE.fullmatch(v)), image)
         yield from (_Node(parts, (*keys, stem), place, named) for stem, parts in _stems(tree))
         for key, value in tree.items():
-            digits = tuple(map(int, re.findall(r"\d+", str(key))))
-            yield from _nodes(value, (*keys, _pattern(str(key))), named, (*place, *digits))
+            digits = _numbers_in(str(key))
+            yield from _nodes(value, (*keys, _pattern(str(key)[:_TEXT_LIMIT])), named, (*place, *digits))
     elif isinstance(tree, list):
         for at, value in enumerate(tree):
             if isinstance(value, (dict, list)):
@@ -250,7 +303,7 @@ def _stems(tree: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Poses whose numbers have a name each that begins alike: tcp_x, tcp_y …; pose1, pose2 …"""
     groups = defaultdict[str, dict[str, float]](dict)
     for key, value in tree.items():
-        part = _PART.fullmatch(str(key).lower())
+        part = _PART.fullmatch(str(key).lower()) if len(str(key)) <= _TEXT_LIMIT else None
         if part and part[1] and isinstance(value, (int, float)):
             groups[part[1]][part[2]] = value
     for stem, parts in groups.items():
@@ -268,7 +321,12 @@ def _flat(value: Any) -> list[float] | None:
     if isinstance(value, list):
         parts = [_flat(part) for part in value]
         return None if None in parts else [number for part in parts if part for number in part]
-    return [float(value)] if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        return [float(value)]
+    except OverflowError:  # a whole number of some hundred digits
+        return None
 
 
 def _is_matrix(value: Any) -> bool:
@@ -291,7 +349,7 @@ def _pose(value: Any) -> tuple[list[float], str, str] | None:
     told = {_plain_key(str(key)): each for key, each in value.items()}
     for rotation, columns in _COLUMNS.items():
         flat = _flat([told.get(name) for name in ("x", "y", "z", *columns)])
-        if flat is not None:
+        if flat is not None and np.isfinite(flat).all():
             return flat, rotation, ""
     return None
 
@@ -321,6 +379,8 @@ def _half_of(word: str) -> str | None:
 def _facts(node: _Node, found: Contents) -> None:
     """Note a camera's matrix, by its form, and what describes a board."""
     numbers = _flat(node.value) if isinstance(node.value, (list, dict)) else None
+    if numbers and not np.isfinite(numbers).all():
+        return
     key = node.keys[-1].lower() if node.keys else ""
     if numbers and len(numbers) >= 9:
         K = np.array(numbers[:9]).reshape(3, 3)
@@ -333,8 +393,14 @@ def _facts(node: _Node, found: Contents) -> None:
         found.cameras[-1] = found.cameras[-1][0], tuple(numbers)
     if isinstance(node.value, dict):
         told = {str(k).lower(): v for k, v in node.value.items()}
-        if {"fx", "fy", "cx", "cy"} <= told.keys() and not found.cameras:
-            K = np.array([[told["fx"], 0, told["cx"]], [0, told["fy"], told["cy"]], [0, 0, 1]], float)
-            found.cameras.append((K, ()))
-    if not isinstance(node.value, (dict, list)) or (numbers and len(numbers) == 2):
-        found.facts.setdefault(key, numbers or node.value)
+        lens = _flat([told.get(name) for name in ("fx", "fy", "cx", "cy")])
+        if lens and len(lens) == 4 and np.isfinite(lens).all() and not found.cameras:
+            fx, fy, cx, cy = lens
+            found.cameras.append((np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), ()))
+    if isinstance(node.value, str):
+        found.facts.setdefault(key, node.value[:_TEXT_LIMIT])
+    elif isinstance(node.value, (dict, list)):
+        if numbers and len(numbers) == 2:
+            found.facts.setdefault(key, numbers)
+    elif node.value is None or isinstance(node.value, bool) or abs((_flat(node.value) or [np.inf])[0]) < 1e15:
+        found.facts.setdefault(key, node.value)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+import zipfile
 from collections import defaultdict
 from io import BytesIO
 from pathlib import Path
@@ -12,31 +14,41 @@ from xml.etree import ElementTree
 
 import numpy as np
 import yaml
-from scipy.io import loadmat
 
 from recordings import strict_yaml
 from recordings.files import read_file
 
 _BYTES_LIMIT, _ARRAY_LIMIT_BYTES = 4 * 1024 * 1024, 128 * 1024
+_UNPACKED_LIMIT_BYTES = 4 * 1024 * 1024
+"""Of an archive of arrays."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 _YAML = (".yaml", ".yml", ".samples", ".calib")
 _SUFFIXES = (*_YAML, ".json", ".xml", ".csv", ".txt", ".dat", ".tsv", ".script")
-_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
-IMAGE = re.compile(rf"[^\s,;'\"\[\]]+(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))})\b", re.I)
-"""A name of an image."""
+_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d++(?:\.\d*+)?+|\.\d++)(?:[eE][-+]?\d++)?+(?![\w.])")
+_OF_A_NAME = r"[^\s,;'\"\[\]]"
+IMAGE = re.compile(
+    rf"(?<!{_OF_A_NAME}){_OF_A_NAME}+(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))})\b", re.IGNORECASE
+)
+"""A name of an image. Like the number, it is looked for from the beginning of a word, not from each of its
+letters: the time grows with the line's length, not with its square."""
 POSE_SIZES = (6, 7, 12, 16, 8, 13, 17)
 """Numbers of a pose; the last three with a time stamp or a running number before them."""
 
 
+class UnreadableArraysError(ValueError):
+    """A file of arrays from which no numbers can be taken; says why."""
+
+
 def read_tree(path: Path) -> Any:
-    """A data file as dicts, lists, numbers and texts; None: no such file, or not readable as what it says."""
+    """A data file as dicts, lists, numbers and texts; None: no such file, or not readable as what it says.
+
+    Raises UnreadableArraysError for a damaged .npy, .npz or .mat.
+    """
     suffix = path.suffix.lower()
     try:
         if suffix in (".npy", ".npz", ".mat"):
-            array = BytesIO(read_file(path, _ARRAY_LIMIT_BYTES))  # larger: an image of depths
-            loaded = loadmat(array) if suffix == ".mat" else np.load(array, allow_pickle=False)
-            held = {path.stem: loaded} if suffix == ".npy" else loaded
-            return {key: held[key].tolist() for key in held if not key.startswith("__")}
+            content = read_file(path, _ARRAY_LIMIT_BYTES)  # larger: an image of depths
+            return {name: array.tolist() for name, array in _arrays(path, content).items()}
         if suffix not in _SUFFIXES:
             return None
         content = read_file(path, _BYTES_LIMIT)
@@ -48,8 +60,50 @@ def read_tree(path: Path) -> Any:
         if suffix == ".xml":
             return _of_xml(ElementTree.fromstring(content))
         return _of_text(content.decode("utf-8-sig", "replace"))
+    except UnreadableArraysError:
+        raise
     except (OSError, ValueError, EOFError, RecursionError, yaml.YAMLError, ElementTree.ParseError):
         return None
+
+
+def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray[Any, Any]]:
+    """Arrays by name. UnreadableArraysError for whatever the libraries make of a damaged file."""
+    try:
+        if path.suffix.lower() == ".npy":
+            return {path.stem: _array(content)}
+        if path.suffix.lower() == ".npz":
+            return _unpacked(content)
+        from scipy.io import loadmat  # half of the time that a reader needs to start; few folders have one
+
+        loaded = loadmat(BytesIO(content))
+        return {name: array for name, array in loaded.items() if not name.startswith("__")}
+    except MemoryError:
+        raise
+    except Exception as error:  # zlib's, zipfile's, the libraries' own and those that they did not foresee
+        raise UnreadableArraysError(str(error) or repr(error)) from error
+
+
+def _unpacked(content: bytes) -> dict[str, np.ndarray[Any, Any]]:
+    """The arrays of an .npz: not unpacked where that takes more memory than poses do."""
+    with zipfile.ZipFile(BytesIO(content)) as archive:
+        members = archive.infolist()
+        if sum(member.file_size for member in members) > _UNPACKED_LIMIT_BYTES:
+            raise ValueError(f"unpacked it is larger than {_UNPACKED_LIMIT_BYTES >> 20} MiB")
+        return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
+
+
+def _array(content: bytes) -> np.ndarray[Any, Any]:
+    """The array of an .npy whose header claims no more than follows it."""
+    file = BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    if version == (1, 0):
+        shape, _, kind = np.lib.format.read_array_header_1_0(file)
+    else:
+        shape, _, kind = np.lib.format.read_array_header_2_0(file)
+    claimed = math.prod(shape) * kind.itemsize
+    if not kind.hasobject and claimed > len(content) - file.tell():
+        raise ValueError(f"its header claims {claimed} bytes, and {len(content) - file.tell()} follow")
+    return np.asarray(np.load(BytesIO(content), allow_pickle=False))
 
 
 def _of_xml(element: ElementTree.Element) -> Any:
@@ -78,7 +132,7 @@ def _of_text(text: str) -> Any:
         rest = line.replace(image[0], "") if image else line
         inside = [_numbers(part) for part in re.findall(r"\[([^\[\]]+)\]", rest)]
         numbers = next((part for part in inside if len(part) in POSE_SIZES), _numbers(rest))
-        said = _NUMBER.sub("", re.sub(r"\[.*?\]", "", rest))
+        said = _NUMBER.sub("", re.sub(r"\[[^\[\]]*+\]", "", rest))
         label = " ".join(re.findall(r"[A-Za-z]\w*", said))[:40]
         if not numbers and not image:
             heading = label

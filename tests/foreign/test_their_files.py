@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from recordings.cli import main
 from recordings.images import viewable
 from recordings.importers.bag import import_bag
-from recordings.importers.messages import ros_types
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import JOINT_SPEED_RAD_S, LEAST_SAMPLES, StandstillLimits
 from recordings.reader import open_recording
@@ -200,9 +198,10 @@ def test_what_cannot_be_imported_is_named(tmp_path: Path, name: str) -> None:
 
 def test_without_rosbags_the_way_out_is_named(tmp_path: Path, description: Path, monkeypatch) -> None:
     source = write_ros_mcap(tmp_path / "a.mcap")
-    ros_types.cache_clear()
-    for module in ("rosbags.typesys", "rosbags.highlevel"):
-        monkeypatch.setitem(sys.modules, module, None)
+    without = tmp_path / "without"
+    without.mkdir()
+    (without / "rosbags.py").write_text("raise ImportError")
+    monkeypatch.syspath_prepend(without)  # the reader finds modules where this process does
     with refused("missing-package"):
         import_bag(source, tmp_path / "out.mcap", description)
     assert not (tmp_path / "out.mcap").exists()

@@ -62,7 +62,14 @@ def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None
 def test_a_folder_of_images_may_be_a_link(folder: Path, tmp_path: Path) -> None:
     (folder / "images").rename(tmp_path / "elsewhere")
     (folder / "images").symlink_to(tmp_path / "elsewhere")
-    assert import_folder(folder, tmp_path / "out.mcap").images == len(look(folder).images["images/#.png"])
+    assert import_folder(folder, tmp_path / "out.mcap").images == 3
+    held = look(folder)
+    assert not held.images  # which images are meant is not told, and a link may lead anywhere
+    assert list(held.unread) == ["images"]
+    (folder / "images").unlink()
+    (tmp_path / "elsewhere").rename(folder / "here")
+    (folder / "images").symlink_to("here")
+    assert sum(map(len, look(folder).images.values())) == 3
 
 
 def test_other_formats_and_colour_are_stored_without_loss(folder: Path, tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-import recordings
 from recordings import errors
 from recordings.errors import ErrorData, ImportSourceError, RecordingError
 from recordings.importers.dataset import Dataset, PoseLine, PoseRow, pose_rows
@@ -196,7 +195,7 @@ def _answers(
 
 def _module_path() -> list[str]:
     """Where this process finds modules: the reader finds the same ones."""
-    own = str(Path(recordings.__file__).parent.parent)
+    own = str(Path(__file__).parents[2])
     path = [each for each in sys.path if each]
     return path if own in path else [*path, own]
 
@@ -207,15 +206,16 @@ def _frames(process: subprocess.Popen[bytes], source: Path, progress: Progress) 
     descriptor = process.stdout.fileno()
     reads = source
     has_answered = False
+    has_content = False
     while True:
         try:
             plain, blobs = read_frame(lambda length: _exactly(descriptor, length))
             answer: Any = msgspec.convert(plain, Answer, strict=True)
         except EOFError:
             cause = _cause_of_death(process, has_answered)
-            if cause == "":
+            if cause == "" and has_content:
                 return
-            raise _error(cause, reads) from None
+            raise _error(cause or "no-answer", reads) from None
         except TimeoutError:
             raise _error("silent", reads) from None
         except (ValueError, RecursionError, msgspec.ValidationError) as error:
@@ -233,6 +233,7 @@ def _frames(process: subprocess.Popen[bytes], source: Path, progress: Progress) 
             case Broken():
                 raise _error(answer.cause, reads, answer.reason)
             case _:
+                has_content = True
                 yield answer, blobs
 
 

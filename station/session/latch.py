@@ -48,6 +48,14 @@ class Latch(msgspec.Struct, frozen=True, omit_defaults=True):
     needs_person: bool = True
     """Only a person at a terminal may acknowledge it, as for every real arm that the station moves."""
     since_wall_ns: int = 0
+    """0: not known."""
+
+    @property
+    def when(self) -> str:
+        """When it was latched, in this computer's time, for people."""
+        if not self.since_wall_ns:
+            return "at an unknown time"
+        return time.strftime("on %Y-%m-%d at %H:%M", time.localtime(self.since_wall_ns / 1e9))
 
 
 class LatchKeeper:

@@ -107,14 +107,16 @@ class Session:
     def _enter_latched(self, left: Latch) -> None:
         """Begin in the latched state that an earlier daemon on this folder left."""
         store = self.store
+        said = f"{left.reason} That was {left.when}, before this daemon began."
         if left.state is None:
-            store.event("services-barred", f"Services may not approve motion yet: {left.reason}", "warning")
+            store.event("services-barred", f"Services may not approve motion yet: {said}", "warning")
             return
         if store.state in LATCHED:  # by an interrupted session, which says what is saved
             store.update(reason=f"{store.status.reason} Before that: {left.reason}")
         else:
-            store.enter(StationState(left.state), left.reason, left.cause)
-        store.event("latched-before", f"Latched since before this daemon began: {left.reason}", "warning")
+            store.enter(StationState(left.state), said, left.cause)
+            self.latch.begin_with(left)  # the next daemon is told the same, and when it was
+        store.event("latched-before", f"Latched: {said}", "warning")
 
     def _show_latch(self, latch: Latch | None) -> None:
         self.store.update(services_barred=latch.reason if latch is not None and latch.needs_person else "")

@@ -17,7 +17,7 @@ from calibrate.arm_table import FramePose
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.document import solver_software
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Sigma, encode_calibration, write_encoded
+from calibrate.files.calibration import Sigma, encode_calibration, require_readable, write_encoded
 from calibrate.files.integrity import content_sha256
 from calibrate.files.lines import append_line, read_lines
 from calibrate.job import JobOptions, solve_recording
@@ -121,6 +121,7 @@ def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tup
         with bounded(limits):
             job = solve_recording(Path(recording), replace(options, threads=1))
         content = encode_calibration(job.calibration)
+        require_readable(content, recording)  # here, where it fails this recording alone
     except (CalibrationError, RecordingError) as problem:
         return BatchResult(recording, key, False, error=str(problem)), b""
     except Exception as problem:  # a defect in one recording must not stop the other 199

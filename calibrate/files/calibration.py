@@ -266,14 +266,15 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
 
 def write_encoded(path: Path, content: bytes) -> None:
     """Write what `encode_calibration` returned; see `write_calibration`."""
+    write_output(path, content, lambda written: require_readable(read_bounded(written), str(path)))
 
-    def check(written: Path) -> None:
-        try:
-            decode_calibration(read_bounded(written), str(path))
-        except CalibrationFileError as problem:
-            raise CalibrationFileError("unreadable-result", path=path, why=str(problem)) from problem
 
-    write_output(path, content, check)
+def require_readable(content: bytes, where: str) -> None:
+    """Read what is to be kept as users will. CalibrationFileError `unreadable-result` where that fails."""
+    try:
+        decode_calibration(content, where)
+    except CalibrationFileError as problem:
+        raise CalibrationFileError("unreadable-result", path=where, why=str(problem)) from problem
 
 
 def write_output(path: Path, content: bytes, check: Callable[[Path], object] | None = None) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from calibrate.batch import run
 from calibrate.batch.run import RESULTS, BatchResult, batch_key, run_batch
 from calibrate.batch.workers import Lost, R, T, pool
 from calibrate.document import _source_sha256
@@ -141,6 +142,17 @@ def test_other_options_or_a_changed_recording_are_solved_again(
     recordings[1].write_bytes(b"new data")
     os.utime(folder, ns=(told.st_atime_ns, told.st_mtime_ns))
     assert before != batch_key(folder, JobOptions())
+
+
+def test_a_result_that_nobody_could_read_fails_its_recording_alone(
+    recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run.encode_calibration
+    contents = iter([lambda found: whole(found)[:-40], whole, whole])
+    monkeypatch.setattr(run, "encode_calibration", lambda found: next(contents)(found))
+    results = run_batch(recordings, tmp_path / "out", workers=in_this_process)
+    assert [result.solved for result in results] == [False, True, True]
+    assert len(list((tmp_path / "out").glob("*.yaml"))) == 2
 
 
 def test_a_name_may_be_long_and_of_any_bytes(recordings: list[Path], tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from calibrate.files.install import (
 from calibrate.files.sealed_lines import sealed_content
 from calibrate.files.touch import Touch
 from calibrate.files.validity import ValidityReason, ValidityState
+from calibrate.files.validity_log import FILE
 from calibrate.files.versions import note_installed
 from tests.durability import after_power_cut, watched_disk
 
@@ -121,6 +122,9 @@ def test_a_disk_that_refuses_any_one_request_leaves_the_old_or_the_new(
                 break
             now = found(place)
             assert now == new if acknowledged else now in (old, new), disk.requests[refused]
+            request = disk.requests[refused]
+            if not acknowledged and request.path.name == FILE and request.kind in ("write", "sync"):
+                assert now == old, "a line that nobody was told of is taken back"
             ACTS[act](place)
             refused += 1
         assert refused >= 2

@@ -30,7 +30,7 @@ from scipy.io import savemat
 import recordings
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration, write_calibration
-from calibrate.imported import believe
+from calibrate.imported import Given, believe
 from calibrate.job import solve_recording
 from recordings.errors import CodedError
 from recordings.image_headers import IMAGE_LIMIT_BYTES, ImageError, read_header
@@ -166,7 +166,7 @@ def _bag_in(write: Callable[[Path], Path]) -> Callable[[Path], Path]:
 
 
 def _believed(folder: Path) -> object:
-    return believe(reader.look(folder))
+    return believe(reader.look(folder), Given(mount="eye-in-hand"))
 
 
 def _read_image(folder: Path) -> object:
@@ -328,7 +328,7 @@ def read_here(target: Target, folder: Path) -> tuple[str, str]:
     try:
         for answer, _ in reader_main.answered(target.request(folder), lambda told: None):
             if isinstance(answer, Broken):
-                return "caught", answer.reason
+                return "caught", f"{answer.cause} {answer.reason}"
             end = "coded" if type(answer).__name__ == "Refused" else "read"
     except Exception:
         return "traceback", traceback.format_exc()[-1500:]
@@ -443,9 +443,7 @@ def main() -> int:
         print(f"{target.name:<26} {len(own):>5} {dict(ends)} slowest {slowest:.2f} s")
     children_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     print(f"{len(outcomes)} cases, seed {told.seed}, peak {max(peak_mb, children_mb):.0f} MB")
-    for said, count in Counter(
-        o.said.splitlines()[-1][:90] for o in outcomes if o.end == "caught"
-    ).most_common(12):
+    for said, count in Counter(o.said[:90] for o in outcomes if o.end == "caught").most_common(12):
         print(f"  caught {count}: {said}")
     for outcome in outcomes:
         if outcome.said.startswith("after a death"):

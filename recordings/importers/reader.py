@@ -180,17 +180,19 @@ def _answers(
         )
     except OSError as error:
         raise _error("not-started", source, str(error)) from error
+    assert process.stdin is not None
+    assert process.stdout is not None
     try:
-        with suppress(BrokenPipeError):
-            assert process.stdin is not None
+        with suppress(BrokenPipeError):  # one that cannot start says so by its end
             process.stdin.write(b"".join(packed(request)))
-            process.stdin.close()
+            process.stdin.flush()
         yield _frames(process, source, progress)
     finally:
         process.kill()
         process.wait()
-        assert process.stdout is not None
         process.stdout.close()
+        with suppress(BrokenPipeError):
+            process.stdin.close()
 
 
 def _module_path() -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import msgspec
@@ -216,8 +216,38 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
                         seen = group[np.linalg.norm(seen[:, None] - group, axis=2).argmin(axis=1)]
                     ordered = _best_order(seen, spec)
                     if ordered is not None and _is_even(ordered, spec):
-                        return true_centres(grey, ordered, spec)
+                        centres = true_centres(grey, ordered, spec)
+                        if are_round(grey, centres, spec):
+                            return centres
     return None
+
+
+_SQUARE_HARMONIC = 3 / 7
+"""|∫ z⁴| over ∫ |z|⁴ of a square about its middle at any turn, z = x + iy: 16/15 over 112/45 for a side of 2.
+Of a disc it is 0."""
+
+
+def are_round(grey: Grey, centres: Array, spec: BoardSpec) -> bool:
+    """Tell whether the spots of a grid are circles: a chessboard's dark squares lie in such a grid, too.
+
+    centres: (n, 2) px in board order. Seen at right angles, the fourth angular harmonic of most spots is
+    nearer to a disc's, 0, than to a square's.
+    """
+    H = _homography(centres, spec)
+    if H is None:
+        return False
+    spots = _spots(grey, H, np.zeros_like(centres), spec)
+    z = spots.u + 1j * spots.v
+    harmonic = np.abs((spots.share * z**4).sum(axis=(1, 2)))
+    size = np.maximum((spots.share * np.abs(z) ** 4).sum(axis=(1, 2)), 1e-12)
+    return float(np.median(harmonic / size)) < _SQUARE_HARMONIC / 2
+
+
+def _homography(centres: Array, spec: BoardSpec) -> Array | None:
+    """Fit H (3, 3) from the board's plane, in pitches, to pixels (n, 2); None: there is none."""
+    plane = board_points(spec)[:, :2] / spec.square_m
+    found: Any = cv2.findHomography(plane, centres, 0)
+    return None if found[0] is None else np.asarray(found[0])
 
 
 def _is_even(centres: Array, spec: BoardSpec) -> bool:
@@ -248,12 +278,13 @@ def true_centres(grey: Grey, ellipses: Array, spec: BoardSpec) -> Array:
     c = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     centres = ellipses
     for _ in range(2):  # the plane itself was fitted to ellipses first
-        found: Any = cv2.findHomography(plane, centres, 0)
-        H = found[0]
+        H = _homography(centres, spec)
         if H is None:
             return ellipses
         seen = c @ H.T
-        radius, middles = _ink(grey, H, centres - seen[:, :2] / seen[:, 2:], spec)
+        bend = centres - seen[:, :2] / seen[:, 2:]
+        spots = _spots(grey, H, bend, spec)
+        radius, middles = spots.radius, _middles(spots, H, bend, spec)
         shown = seen * seen[:, 2:] - radius**2 * (H[:, :2] @ H[2, :2])
         centres = ellipses - (shown[:, :2] / shown[:, 2:] - seen[:, :2] / seen[:, 2:])
         guessed = np.linalg.norm(centres - middles, axis=1) > _GUESSED_PX
@@ -261,11 +292,20 @@ def true_centres(grey: Grey, ellipses: Array, spec: BoardSpec) -> Array:
     return np.asarray(centres)
 
 
-def _ink(grey: Grey, H: Array, bend: Array, spec: BoardSpec) -> tuple[float, Array]:
-    """Radius of the circles over the pitch, and the middle of each (n, 2) px, seen at right angles.
+class Spots(NamedTuple):
+    """Patches round the spots of a grid, seen at right angles."""
 
-    bend: (n, 2) px from where H shows a circle to where it is.
-    """
+    u: Array
+    """(side, side), pitches from the middle of the patch."""
+    v: Array
+    share: Array
+    """(n, side, side), 0…1: how much of it is ink, of the spot alone."""
+    radius: float
+    """Of a circle of the spots' median area, over the pitch."""
+
+
+def _spots(grey: Grey, H: Array, bend: Array, spec: BoardSpec) -> Spots:
+    """Look at each spot of a grid. bend: (n, 2) px from where H shows a spot to where it is."""
     reach = 0.6 if spec.kind is BoardKind.ASYMMETRIC_CIRCLES else 0.5
     side = 2 * _CELLS + 1
     v, u = np.mgrid[-reach : reach : side * 1j, -reach : reach : side * 1j]
@@ -284,9 +324,16 @@ def _ink(grey: Grey, H: Array, bend: Array, spec: BoardSpec) -> tuple[float, Arr
     share = np.clip((patches - paper) / contrast, 0.0, 1.0)
     radius = float(np.sqrt(np.median(share.sum(axis=(1, 2))) / np.pi) * reach / _CELLS)
     share *= u * u + v * v < (1.4 * radius) ** 2  # the sheet may end beyond
+    return Spots(u, v, share, radius)
+
+
+def _middles(spots: Spots, H: Array, bend: Array, spec: BoardSpec) -> Array:
+    """Find the middle of each spot's ink (n, 2) px."""
+    centres = board_points(spec)[:, :2] / spec.square_m
+    u, v, share = spots.u, spots.v, spots.share
     area = np.maximum(share.sum(axis=(1, 2)), 1e-9)
     offset = np.stack([(share * u).sum(axis=(1, 2)), (share * v).sum(axis=(1, 2))], axis=-1) / area[:, None]
-    return radius, through(H, centres + offset) + bend
+    return through(H, centres + offset) + bend
 
 
 def _best_order(centres: Array, spec: BoardSpec) -> Array | None:

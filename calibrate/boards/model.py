@@ -184,6 +184,8 @@ def describe_board(spec: BoardSpec) -> str:
     if spec.kind in SINGLE_TAGS:
         return f"{spec.kind.value} {spec.tag_id} of {tag_dictionary(spec)}, {spec.square_m * 1000:g} mm"
     text = f"{spec.kind.value} {spec.columns}×{spec.rows}, {spec.square_m * 1000:g} mm"
+    if spec.square_guessed:
+        text += " by the arm's motion"
     if spec.kind is BoardKind.CHARUCO:
         layout = ", legacy layout" if spec.legacy else ""
         text += f", markers {(spec.marker_m or 0) * 1000:g} mm {spec.dictionary}{layout}"

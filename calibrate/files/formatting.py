@@ -16,7 +16,7 @@ from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.geometry import roll_pitch_yaw
 from calibrate.results import BoardShape
-from recordings.schema.messages import Source
+from recordings.schema.messages import BoardSpec, Source
 
 SOURCE_STAMPS: dict[Source, str] = {
     "real": "",
@@ -197,7 +197,7 @@ def cell_sentences(calibration: Calibration) -> list[str]:
     quality = calibration.quality
     sentences: list[str] = []
     if quality.board is not None:
-        sentences += _board(quality.board, calibration.board.square_m * 1e3)
+        sentences += _board(quality.board, calibration.board)
     name, share = next(iter(error_shares(calibration).items()), ("", 0.0))
     if share > _LARGE_SHARE and name in _REMEDIES:
         remedy, arm = _REMEDIES[name], calibration.arm_table
@@ -243,13 +243,13 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
         yield f"The corrected arm is not offered: {_REFUSED.get(arm.refused, arm.refused)}."
 
 
-def _board(board: BoardShape, square_mm: float) -> Iterator[str]:
-    if abs(board.scale) > _CLEAR_SIGMAS * board.sigma[0]:
-        size = square_mm * (1 + board.scale)
-        yield (
-            f"The board's squares are {size:.3f} ± {square_mm * board.sigma[0]:.3f} mm, "
-            f"{square_mm:g} mm are stated."
-        )
+def _board(board: BoardShape, spec: BoardSpec) -> Iterator[str]:
+    square_mm = 1e3 * spec.square_m
+    measured = f"{square_mm * (1 + board.scale):.3f} ± {square_mm * board.sigma[0]:.3f} mm"
+    if spec.square_guessed:
+        yield f"The board's squares are {measured} by the arm's motion: nobody told their size. Measure them."
+    elif abs(board.scale) > _CLEAR_SIGMAS * board.sigma[0]:
+        yield f"The board's squares are {measured}, {square_mm:g} mm are stated."
     if abs(board.anisotropy) > _CLEAR_SIGMAS * board.sigma[1]:
         wider = "wider than tall" if board.anisotropy > 0 else "taller than wide"
         yield f"The print is {abs(board.anisotropy):.2%} {wider}."

@@ -31,8 +31,10 @@ class BoardTolerance:
     """1σ of the board's shape against its drawing."""
 
     square: float = 0.003
-    """Relative, of the size of the squares, and of their size in x against that in y."""
+    """Relative, of the size of the squares."""
     flatness_m: float = 0.001
+    anisotropy: float | None = None
+    """Relative, of the squares' size in x against that in y; None: as `square`."""
 
     def __post_init__(self) -> None:
         require_positive(square=self.square, flatness_m=self.flatness_m)
@@ -40,15 +42,20 @@ class BoardTolerance:
     @property
     def sigma(self) -> Array:
         """1σ (5,) of the board's shape, in the order of `SHAPE`."""
-        return np.array([self.square, self.square, self.flatness_m, self.flatness_m, self.flatness_m])
+        anisotropy = self.square if self.anisotropy is None else self.anisotropy
+        return np.array([self.square, anisotropy, self.flatness_m, self.flatness_m, self.flatness_m])
 
     @classmethod
     def of(cls, board: BoardSpec, usual: BoardTolerance | None = None) -> BoardTolerance:
-        """Take what the board's description states, else `usual`; None: the defaults."""
+        """Take what the board's description states, else `usual`; None: the defaults.
+
+        A guessed size says nothing about the print: its squares are as square as usual.
+        """
         usual = usual or cls()
         return cls(
             usual.square if board.square_tolerance is None else board.square_tolerance,
             usual.flatness_m if board.flatness_m is None else board.flatness_m,
+            usual.square if board.square_guessed else None,
         )
 
 

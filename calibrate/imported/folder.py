@@ -18,8 +18,10 @@ from recordings.importers.conventions import Convention, convention, tells_direc
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
 from recordings.importers.messages import Progress
 from recordings.importers.tables import Contents, Table, natural
-from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount
+from recordings.schema.messages import LARGEST_TOLERANCE, BoardSpec, CameraModel, Matrix4, Mount
 
+LEAST_GUESSED_TOLERANCE = 0.003
+"""Relative: no guess from some images is nearer than what a board is printed to."""
 _MADE = re.compile(r"draw|calibrated|overlay|visual|detect|result|undist|depth|corner|IR\b|axes", re.I)
 """Names of images that a program painted on, or that another camera took."""
 
@@ -178,19 +180,45 @@ def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
     return Believed(dataset, _rows(held, best.table, how, pairs, saw, joints), facts)
 
 
+_USUAL_SQUARES_MM = (
+    *(5, 6, 8, 10, 12, 15, 16, 18, 20, 22, 24, 25, 28, 30, 32, 35, 36, 40, 45, 50),
+    *(60, 70, 75, 80, 90, 100, 120, 150, 200),
+)
+"""Sides of squares that people print."""
+_FITS_SIGMAS = 2.0
+"""A usual size nearer to the guess than so many of its sigmas fits it."""
+
+
 def _board(best: TableReading) -> tuple[BoardSpec, str]:
-    """(the board, how its size is known); where nothing tells the squares, the arm's motion does."""
+    """(the board, how its size is known); where nothing tells the squares, the arm's motion does.
+
+    The guess keeps its own value and uncertainty. ImportSourceError where two sizes that people print fit it.
+    """
     board = best.seen.board
     if best.seen.square_known:
         return board, "as described"
     factor = float(best.fit.factors[0])
-    sigma = float(np.sqrt(np.linalg.inv(best.fit.solved.precision)[-2, -2]))
-    square_m = factor * GUESSED_M
-    tolerance = min(0.1, max(3 * sigma / factor, 0.01))
-    near = round(square_m * 2000) / 2000
-    shown = near if abs(near - square_m) < tolerance * square_m else square_m
-    board = msgspec.structs.replace(board, square_m=round(shown, 6), square_tolerance=round(tolerance, 4))
-    return board, f"square by the arm's motion: {1e3 * square_m:.2f} mm"
+    share = float(np.sqrt(np.linalg.inv(best.fit.solved.precision)[-2, -2])) / factor
+    square_mm = 1e3 * factor * GUESSED_M
+    sigma_mm = share * square_mm
+    usual = [size for size in _USUAL_SQUARES_MM if abs(size - square_mm) < _FITS_SIGMAS * sigma_mm]
+    if len(usual) > 1:
+        raise ImportSourceError(
+            "square-unclear",
+            square_mm=square_mm,
+            sigma_mm=sigma_mm,
+            usual=" or ".join(map(str, usual)),
+            board=f"{board.columns}x{board.rows} {usual[0]}",
+        )
+    # The solve sees the same motion again: what it was guessed from must not count twice.
+    tolerance = float(np.clip(3 * share, LEAST_GUESSED_TOLERANCE, LARGEST_TOLERANCE))
+    guessed = msgspec.structs.replace(
+        board,
+        square_m=round(1e-3 * square_mm, 6),
+        square_tolerance=round(tolerance, 4),
+        square_guessed=True,
+    )
+    return guessed, f"square by the arm's motion: {square_mm:.2f} ± {sigma_mm:.2f} mm; measure it"
 
 
 def _rows(

@@ -69,6 +69,8 @@ class BoardSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
     """Relative standard uncertainty of `square_m`; None: the solver's default."""
     flatness_m: float | None = None
     """Standard deviation of the board's points from a plane; None: the solver's default."""
+    square_guessed: bool = False
+    """Nobody told `square_m`: the arm's motion did, within `square_tolerance`."""
 
 
 LARGEST_TOLERANCE = 0.1

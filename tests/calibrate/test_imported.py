@@ -100,6 +100,43 @@ def test_poses_are_read_as_they_are_meant(
     assert shown.square_m == pytest.approx(true.square_m, rel=0.02)
 
 
+def with_noise(poses: np.ndarray, sigma_m: float) -> np.ndarray:
+    """As an arm tells them that misses by so much, each pose by itself."""
+    noisy = poses.copy()
+    noisy[:, :3, 3] += np.random.default_rng(7).normal(0.0, sigma_m, (len(poses), 3))
+    return noisy
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 0.002])
+def test_squares_that_nobody_told_keep_what_the_arm_says_of_them(
+    put: Callable[..., Path], images: tuple[Path, np.ndarray], tmp_path: Path, sigma_m: float
+) -> None:
+    """A guess is not rounded to what looks well, is never called stated, and holds within its sigma."""
+    folder = put(HOLDERS[0], lambda poses: with_noise(poses, sigma_m))
+    found = believe(look(folder)).dataset.board
+    assert found.square_guessed and found.square_tolerance is not None
+    assert abs(found.square_m / TURNED.board.square_m - 1) < found.square_tolerance
+    rec = tmp_path / "guessed.mcap"
+    assert call(main, "import", folder, "-o", rec, "--json").returncode == 0
+    solved = solve_recording(rec)
+    assert solved.calibration.board.square_guessed
+    shape = solved.calibration.quality.board
+    square_m = found.square_m * (1 + shape.scale)
+    assert abs(square_m - TURNED.board.square_m) < 4 * shape.sigma[0] * found.square_m
+    assert shape.sigma[1] < 0.004, "how square they are is known as for any print"
+    file = tmp_path / "guessed.yaml"
+    write_calibration(solved.calibration, file)
+    assert read_calibration(file).board == solved.calibration.board
+
+
+def test_where_two_sizes_that_people_print_fit_it_is_asked(put: Callable[..., Path]) -> None:
+    folder = put(HOLDERS[0], lambda poses: with_noise(poses, 0.004))
+    with raises("square-unclear"):
+        believe(look(folder))
+    told = believe(look(folder), Given(board=TURNED.board)).dataset.board
+    assert not told.square_guessed and told.square_m == TURNED.board.square_m
+
+
 def of_a_frame_at_the_table(T: np.ndarray) -> np.ndarray:
     """As arms with a user frame tell them: board and camera are as near to both frames."""
     return np.linalg.inv(BOARD_PLACE) @ T

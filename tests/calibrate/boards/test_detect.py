@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calibrate.boards.detect import detect
+from calibrate.boards.grids import count_circles, find_circles
 from calibrate.boards.model import (
     BoardError,
     ambiguity_text,
@@ -324,3 +325,25 @@ def test_a_board_under_a_projected_pattern_of_dots_is_found() -> None:
     assert found.corners == found.expected
     miss = found.pixels - project_at(CAMERA, seen, board_points(spec))
     assert np.sqrt(np.square(miss).sum(axis=1).mean()) < 0.6
+
+
+@pytest.mark.parametrize("blur_px", [0.8, 2.5])
+@pytest.mark.parametrize(("columns", "rows"), [(22, 15), (15, 22), (10, 7), (12, 9)])
+def test_the_dark_squares_of_a_chessboard_are_no_circles(columns: int, rows: int, blur_px: float) -> None:
+    """They lie in an asymmetric grid: one of 22 × 15 squares was read as 11 × 15 circles."""
+    dark = np.add.outer(np.arange(rows), np.arange(columns)) % 2
+    flat = np.kron(255 * (1 - dark), np.ones((24, 24))).astype(np.uint8)
+    flat = cv2.copyMakeBorder(flat, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    height, width = flat.shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    seen = corners + np.array([[60, 40], [-30, 80], [-80, -60], [30, -20]], np.float32)
+    tilted = cv2.warpPerspective(
+        cv2.GaussianBlur(flat, (0, 0), blur_px),
+        cv2.getPerspectiveTransform(corners, seen),
+        (width, height),
+        borderValue=200,
+    )
+    count = count_circles(tilted)
+    for size in ((at, count // at) for at in range(3, count // 3 + 1) if count % at == 0):
+        for kind in (BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES):
+            assert find_circles(tilted, BoardSpec(kind, *size, 0.02)) is None, (kind, size)

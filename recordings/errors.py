@@ -19,6 +19,24 @@ from recordings.plain_text import bytes_text
 Value = str | float | int | bool | None
 
 
+def plain_value(value: object) -> Value:
+    """Convert a value by its type to one that every message and file can hold.
+
+    A path becomes its text, a NumPy scalar the Python number that it holds, anything unknown its text.
+    """
+    if value is None or type(value) in (str, float, int, bool):
+        return value  # type: ignore[return-value]  # by the line above
+    if isinstance(value, Path):
+        return str(value)
+    number = getattr(value, "item", None)
+    if callable(number) and getattr(value, "ndim", None) == 0:
+        return plain_value(number())
+    for kind in (bool, int, float, str):  # of a subclass, such as a member of StrEnum
+        if isinstance(value, kind):
+            return kind(value)
+    return str(value)
+
+
 @dataclass(frozen=True)  # no msgspec: programs that only use the camera import this
 class ErrorData:
     """An error on the wire, in a status and in `--json`."""
@@ -58,7 +76,7 @@ class CodedError(Exception):
     def __init__(self, code: str = "", /, **values: Value | Path) -> None:
         super().__init__(code)
         self.code = code or self.code
-        self.values = {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
+        self.values = {name: plain_value(value) for name, value in values.items()}
         self.text, self.remedy = worded(self.package, self.code, self.values)
 
     @classmethod

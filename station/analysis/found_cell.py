@@ -155,7 +155,8 @@ def odd_view(
         return None
     implied = implied_flange(mount, quick.X, quick.Y, quick.boards)[-1]
     off = difference(quick.views.base_from_flange[-1], implied)
-    x, y, z = 1000 * off[:3]
-    return StationError(
-        "odd-view", others=len(seen) - 1, x=x, y=y, z=z, turn=math.degrees(float(np.linalg.norm(off[3:])))
-    )
+    off_m, turn_rad = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
+    if off_m < _LEAST_SIGMA_M and turn_rad < _LEAST_SIGMA_RAD:
+        return None  # an arm's own errors are as large: nothing was told wrong
+    x, y, z = (1000 * off[:3]).tolist()
+    return StationError("odd-view", others=len(seen) - 1, x=x, y=y, z=z, turn=math.degrees(turn_rad))

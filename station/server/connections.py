@@ -28,6 +28,7 @@ from station.protocol.messages import (
     USER_CLIENT_LIMIT,
     Answer,
     Request,
+    answer_line,
 )
 from station.protocol.states import RUNNING
 from station.protocol.verbs import VERBS, Stop
@@ -83,7 +84,7 @@ class ClientServer:
         changes = changed_sections(self._status, status)
         self._status = status
         if changes:
-            line = msgspec.json.encode(Answer(changes=changes)) + b"\n"
+            line = answer_line(Answer(changes=changes))
             in_control = status.lease.client_id if status.state in RUNNING else None
             for connection in list(self._connections):
                 if connection.watching:
@@ -237,7 +238,7 @@ class _Connection:
         self.reply(Answer.refused(request_id, error))
 
     def reply(self, reply: Answer) -> None:
-        self.send(msgspec.json.encode(reply) + b"\n")
+        self.send(answer_line(reply))
 
     def send(self, line: bytes) -> None:
         if self._writer.is_closing():

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.errors import CodedError, RecordingError, Value
+from recordings.errors import CodedError, RecordingError, Value, plain_value
 from recordings.recorder import Recorder
 from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, RobotState, Stamps
@@ -33,6 +33,8 @@ log = logging.getLogger("station.events")
 
 EVENTS_KEPT = 100
 EVENT_TEXT_LIMIT = 400
+REASON_LIMIT = 4000
+"""Most characters of the reason of a state: an error may quote a file."""
 
 
 @dataclass
@@ -210,6 +212,10 @@ def _require_same_plan(cell: Cell, folder: Path, state: SessionState, advice: st
             )
 
 
+def _cut(text: str, limit: int = REASON_LIMIT) -> str:
+    return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
 class StatusStore:
     """Newest status, with callbacks for changes. For the event loop's thread only."""
 
@@ -248,7 +254,7 @@ class StatusStore:
             check_transition(self.state, state)
         if isinstance(reason, CodedError):
             cause = reason.code
-        self.update(state=state, reason=str(reason), cause=cause)
+        self.update(state=state, reason=_cut(str(reason)), cause=cause)
         if state in LATCHED:
             self.latched(str(reason), cause, state)
 
@@ -256,8 +262,9 @@ class StatusStore:
         self, code: str, text: str, level: Level = "info", pose_index: int | None = None, /, **values: Value
     ) -> None:
         """Publish an event to status, log and recording; `code` and `values` are for programs."""
-        text = text if len(text) <= EVENT_TEXT_LIMIT else text[: EVENT_TEXT_LIMIT - 1] + "…"
-        event = Event(time.time_ns(), level, text, pose_index, code, values)
+        text = _cut(text, EVENT_TEXT_LIMIT)
+        plain = {name: plain_value(value) for name, value in values.items()}
+        event = Event(time.time_ns(), level, text, pose_index, code, plain)
         pose = f"pose {pose_index + 1}: " if pose_index is not None else ""
         log.log(getattr(logging, level.upper()), "%s%s", pose, text)
         self.update(events=(*self.status.events, event)[-EVENTS_KEPT:])

@@ -101,3 +101,16 @@ def test_what_cannot_be_is_named_and_what_can_is_not(mount: Mount) -> None:
     found = find_cell(mount, truth.board, blank, False, torn)
     assert found is None or (found.problem and not found.good)
     assert not running_estimate(cell_config(truth), blank, False, torn).enough, "five of seven agree"
+
+
+def test_a_view_off_by_less_than_an_arms_own_errors_is_not_called_odd() -> None:
+    """Among views without noise a millimetre stands out; nobody told a pose wrong by that."""
+    truth = make_cell("paper-binned", seed=3)
+    views = views_of(truth, 10, 1e-6)
+    for off_m, code in ((0.001, ""), (0.05, "odd-view")):
+        last = views[-1].base_from_flange.copy()
+        last[0, 3] += off_m
+        seen = [*views[:-1], replace(views[-1], base_from_flange=last)]
+        found = odd_view(truth.mount, truth.board, truth.camera, True, seen)
+        assert ("" if found is None else found.code) == code
+        assert found is None or all(type(value) in (int, float) for value in found.values.values())

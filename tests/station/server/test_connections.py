@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import socket
 import stat
@@ -12,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import LeaseStatus, StationState, StationStatus
+from station.cell.status import Event, LeaseStatus, StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.messages import LINE_LIMIT_BYTES, Answer
 from station.protocol.verbs import Go
@@ -112,6 +114,18 @@ async def test_watchers_get_everything_once_then_only_changes(server: Served) ->
         publish(control, state=StationState.PAUSED, cell="lab")
         newest = await anext(statuses)
         assert (newest.state, newest.cell) == (StationState.PAUSED, "lab")
+
+
+async def test_a_status_that_cannot_be_encoded_makes_no_client_mute(server: Served) -> None:
+    control, path = server
+    odd = Event(1, "warning", "odd", values={"x": np.float64(1.0), "y": math.nan, "words": "\ud800"})
+    async with Client(path) as first:
+        statuses = first.statuses()
+        await anext(statuses)
+        publish(control, cell="lab", events=(odd,))
+        assert (await anext(statuses)).cell == "lab"
+        async with Client(path) as second:
+            assert (await anext(second.statuses())).cell == "lab"
 
 
 async def test_who_was_answered_knows_what_came_of_it(tmp_path: Path) -> None:

@@ -149,6 +149,7 @@ class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 NO_IMAGE = "no-image"
+NOT_LOOKED = "not-looked"
 
 
 class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -164,7 +165,8 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     tilt_rad: float | None = None
     distance_m: float | None = None
     cause: str = ""
-    """Why no board was found, or over-exposed, under-exposed, blurred, or `NO_IMAGE`; empty: all is well."""
+    """Why no board was found, or over-exposed, under-exposed, blurred, `NO_IMAGE`, or `NOT_LOOKED`: the
+    computer is too busy to look for it in the newest images; empty: all is well."""
     advice: str = ""
     """What is wrong with light or focus, and what to set; empty: nothing."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +17,9 @@ from station.analysis.worker import BoardDetection, preview_image, sight
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.layout import flange_pose
-from station.cell.status import NO_IMAGE, DetectionStatus, StationState
+from station.cell.status import NO_IMAGE, NOT_LOOKED, DetectionStatus, StationState
 from station.cell.stillness import NotStillError
+from station.protocol.states import RUNNING
 from station.protocol.verbs import Observation, Observe, PreviewImage
 from station.session.capture import at_exposure
 from station.session.context import SessionContext
@@ -25,9 +27,25 @@ from station.session.context import SessionContext
 PREVIEW_PERIOD_S = 0.1
 SIDES = (16, 1024)
 OLD_S = 2.0
-"""Age of the newest image from which screens are told that none comes; one lost frame is no news."""
+"""Age of the newest image, or of the newest one in which the board was looked for, from which screens are
+told so; one lost frame is no news."""
+LOOK_S = 0.5
+"""Longest wait for the board to be found in an image before the image is shown without it."""
+PATIENCE_S, PATIENCE_IN_A_RUN_S = 30.0, 5.0
+"""Longest time that looking for the board may take, on a busy computer, before the worker counts as hanging.
+In a run the capture waits behind it."""
 _OBSERVE_S = 5.0
 _TAKING = (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING)
+
+
+class Looked(NamedTuple):
+    """An image, and the board in it."""
+
+    image: Image
+    taken_s: float
+    """When the image came (host monotonic)."""
+    sighting: BoardDetection | None
+    """None: the worker hung or died."""
 
 
 class Previewer:
@@ -37,28 +55,43 @@ class Previewer:
         self._context = context
         self._taking = asyncio.Lock()
         self._picture: Image | None = None
+        """The newest image."""
         self._sighting: BoardDetection | None = None
-        self._taken_s = self._seen_s = 0.0
+        """The board in it; None: it was not looked for, or not in time."""
+        self._taken_s = 0.0
+        """When an image was last asked for (host monotonic); 0: never."""
+        self._seen_s = 0.0
+        """When the newest image came."""
+        self._looked_s = 0.0
+        """When the newest image came in which the board was looked for."""
+        self._looking: asyncio.Task[Looked] | None = None
+        """The search for the board in an image, which may take longer than the next image does."""
         self._count = 0
 
     async def look(self) -> tuple[Image, BoardDetection] | None:
-        """Return image and detection of the newest preview; None without one."""
-        async with self._taking:
-            if time.monotonic() - self._taken_s >= PREVIEW_PERIOD_S:
-                await asyncio.shield(self._take())  # for all screens, also where the one that asked closes
-        if self._picture is None or self._sighting is None:
+        """Return an image and the board in it, however long that takes; None without one."""
+        await self._renew()
+        if self._picture is not None and self._sighting is not None:
+            return self._picture, self._sighting
+        if self._looking is None:
             return None
-        return self._picture, self._sighting
+        looked = await asyncio.shield(self._looking)
+        return None if looked.sighting is None else (looked.image, looked.sighting)
 
     async def preview(self, width: int, height: int) -> PreviewImage:
         """Return a JPEG that fits into width × height, px; empty without an image."""
-        await self.look()
+        await self._renew()
         if self._picture is None:
             return PreviewImage()
         low, high = SIDES
         width, height = min(max(width, low), high), min(max(height, low), high)
         corners = np.zeros((0, 2)) if self._sighting is None else self._sighting.pixels
         return await asyncio.to_thread(preview_image, self._picture, corners, width, height, self._count)
+
+    async def _renew(self) -> None:
+        async with self._taking:
+            if time.monotonic() - self._taken_s >= PREVIEW_PERIOD_S:
+                await asyncio.shield(self._take())  # for all screens, also where the one that asked closes
 
     async def observe(self, tag: BoardSpec) -> Observation:
         """Find the tag's corners in a new image, with the arm's pose at mid-exposure.
@@ -86,9 +119,14 @@ class Previewer:
         )
 
     async def _take(self) -> None:
+        """Take an image, and look for the board in it.
+
+        Where that takes long the image is shown without its board, and the next ones, too, until it is done.
+        """
         context = self._context
         self._taken_s = time.monotonic()
-        if context.store.state in _TAKING or context.workers.waiting:
+        ours = 1 if self._looking is not None else 0
+        if context.store.state in _TAKING or context.workers.waiting > ours:
             return  # camera or worker are needed by the capture
         try:
             image = await context.cell.camera.glimpse()
@@ -97,19 +135,56 @@ class Previewer:
                 context.store.update(detection=DetectionStatus(reason=f"no image: {error}", cause=NO_IMAGE))
             return
         self._seen_s = self._taken_s
+        self._picture = image
+        self._sighting = await self._sighted(image)
+        self._count += 1
+
+    async def _sighted(self, image: Image) -> BoardDetection | None:
+        """Look for the board in the newest image, for `LOOK_S`, and tell the screens what is seen.
+
+        None: it takes longer, or the search in an earlier image does. Then the image is shown without its
+        board.
+        """
+        if self._looking is None:
+            self._looking = asyncio.create_task(self._look_in_worker(image, self._seen_s))
+            await asyncio.wait({self._looking}, timeout=LOOK_S)
+        sighting: BoardDetection | None = None
+        if self._looking.done():
+            looked = self._looking.result()
+            self._looking = None
+            if looked.sighting is not None:
+                self._looked_s = looked.taken_s
+                self._tell(looked.sighting.status)
+            sighting = looked.sighting if looked.image is image else None
+        if self._seen_s - self._looked_s > OLD_S:
+            reason = "not looked at for the board: the computer is busy"
+            self._tell(DetectionStatus(reason=reason, cause=NOT_LOOKED))
+        return sighting
+
+    def _tell(self, detection: DetectionStatus) -> None:
+        """Tell the screens; in a capture they are told of its own image."""
+        if self._context.store.state not in _TAKING:
+            self._context.store.update(detection=detection)
+
+    async def _look_in_worker(self, image: Image, taken_s: float) -> Looked:
+        """Look for the board in the worker."""
+        context = self._context
         config = context.cell.config
+        exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
+        patience_s = PATIENCE_IN_A_RUN_S if context.store.state in RUNNING else PATIENCE_S
         try:
-            exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
-            pixels = viewable(image.pixels, image.pixel_format)
             sighting = await context.workers.call(
-                sight, pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
+                sight,
+                viewable(image.pixels, image.pixel_format),
+                config.board,
+                config.camera.model,
+                False,
+                exposure,
+                timeout_s=patience_s,
             )
         except WorkerError:
             sighting = None
-        self._picture, self._sighting = image, sighting
-        self._count += 1
-        if sighting is not None and context.store.state not in _TAKING:
-            context.store.update(detection=sighting.status)
+        return Looked(image, taken_s, sighting)
 
 
 def _require_between_sessions(context: SessionContext) -> None:

@@ -12,10 +12,11 @@ import pytest
 from calibrate.boards.model import board_points
 from recordings.errors import CodedError
 from recordings.schema.messages import BoardKind, BoardSpec
+from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection
 from station.cell.errors import CameraError
 from station.cell.layout import flange_pose
-from station.cell.status import NO_IMAGE, DetectionStatus
+from station.cell.status import NO_IMAGE, NOT_LOOKED, DetectionStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from station.session import previews
@@ -110,6 +111,43 @@ async def test_a_silent_camera_is_told_and_one_lost_frame_is_not(
     monkeypatch.setattr(previews, "OLD_S", 0.0)
     await look()
     assert told()
+
+
+@pytest.mark.parametrize("worker", ["slow", "hangs"])
+async def test_where_no_board_was_looked_for_none_is_told_and_the_image_goes_on(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, worker: str
+) -> None:
+    """What was seen minutes ago stood under a new image: corners 42/42, and the board was not in it."""
+    call, go_on, calls = rig.worker.call, asyncio.Event(), []
+
+    async def slow(*arguments: Any, **named: Any) -> Any:
+        calls.append(arguments)
+        await go_on.wait()
+        if worker == "hangs":
+            raise WorkerError("worker-late", function="sight")
+        return await call(*arguments, **named)
+
+    monkeypatch.setattr(previews, "PREVIEW_PERIOD_S", 0.0)
+    store = rig.session.store
+    first = await rig.session.previews.preview(64, 64)
+    assert store.status.detection.found and first.corners
+    monkeypatch.setattr(rig.worker, "call", slow)
+    monkeypatch.setattr(previews, "LOOK_S", 0.0)
+    monkeypatch.setattr(previews, "OLD_S", 0.0)
+    second = await rig.session.previews.preview(64, 64)
+    third = await rig.session.previews.preview(64, 64)
+    assert first.sequence < second.sequence < third.sequence and not (second.corners or third.corners)
+    assert store.status.detection.cause == NOT_LOOKED and not store.status.detection.found
+    assert len(calls) == 1, "a slow worker is not asked again meanwhile, nor started anew"
+    waiting = asyncio.create_task(rig.session.previews.look())
+    await asyncio.sleep(0)
+    monkeypatch.setattr(previews, "OLD_S", 60.0)
+    go_on.set()
+    assert (await waiting is None) is (worker == "hangs"), "who needs the board waits for it"
+    monkeypatch.setattr(previews, "LOOK_S", 60.0)
+    await rig.session.previews.preview(64, 64)
+    if worker == "slow":
+        assert store.status.detection.found
 
 
 async def test_a_screen_that_closes_takes_no_look_from_the_others(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,9 @@ from typing import ClassVar
 from textual import events, work
 from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
+from textual.command import DiscoveryHit, Hits, Provider
 from textual.screen import Screen
+from textual.system_commands import SystemCommandsProvider
 
 from station.cell.errors import StationError
 from station.cell.status import MotionPreview, SessionStatus, StationState, StationStatus
@@ -59,12 +61,24 @@ SCREENS: tuple[type[StationScreen], ...] = (
 )
 
 
+class HelpInOrder(SystemCommandsProvider):
+    """Commands of F1 as `get_system_commands` orders them, before anything is typed.
+
+    Textual sorts them by name and preselects the first, which was "Acknowledge": F1 and Enter left STOP.
+    """
+
+    async def discover(self) -> Hits:
+        for command in self.app.get_system_commands(self.screen):
+            yield DiscoveryHit(command.title, command.callback, help=command.help)
+
+
 class StationApp(LivePageApp[None], DaemonApp):
     """One app, several screens; the same keys everywhere.
 
     Screens are drawn from `known` alone. What they ask for goes to the daemon by `daemon`.
     """
 
+    COMMANDS: ClassVar[set[type[Provider] | Callable[[], type[Provider]]]] = {HelpInOrder}
     TITLE = "Calibration station"
     CSS_PATH = "station.tcss"
     MODES: ClassVar[dict[str, type[StationScreen]]] = {screen.MODE: screen for screen in SCREENS}  # type: ignore[assignment]
@@ -277,8 +291,9 @@ class StationApp(LivePageApp[None], DaemonApp):
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """List every key's action by name; what moves the arm asks first from here too.
 
-        Of Textual's own only the theme: its others hide the frame, with STOP, or quit unasked. A question is
-        answered first: over it only what works there by its key.
+        The theme is first, because the first is preselected: nothing that unlatches, moves, deletes or ends
+        may be. Of Textual's own there is no other: they hide the frame, with STOP, or quit unasked.
+        A question is answered first: over it only what works there by its key.
         """
         yield SystemCommand("Theme", "Dark, light, or the terminal's own colours", self.action_change_theme)
         own = screen.BINDINGS if isinstance(screen, StationScreen) else []

@@ -129,6 +129,22 @@ async def test_the_palette_names_the_screen_s_own_keys_too_and_stop_works_in_it(
         await until(pilot, lambda: "stop" in link.verbs)
 
 
+async def test_help_and_enter_do_nothing_that_a_person_did_not_choose(link: FakeLink) -> None:
+    """F12, F1, Enter left STOP: what help shows first is chosen by Enter alone."""
+    link.show(idle(StationState.STOPPED))
+    async with opened(link) as pilot:
+        await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
+        before = list(link.verbs)
+        await pilot.press("f1")
+        palette = pilot.app.screen
+        await until(pilot, lambda: palette.query_one("CommandList").option_count > 5)
+        first = str(palette.query_one("CommandList").get_option_at_index(0).prompt)
+        assert first.startswith("Theme")
+        await pilot.press("enter")
+        await pilot.pause()
+        assert link.verbs == before
+
+
 @pytest.mark.parametrize(
     ("state", "holder", "asks"),
     [(StationState.MOVING, 7, True), (StationState.MOVING, 8, False), (StationState.PAUSED, 7, False)],

@@ -51,22 +51,25 @@ def read_folder(
     mount: Mount | None = None,
     convention: str | None = None,
     poses: Path | str | None = None,
+    images: str | None = None,
 ) -> Pictures:
     """Read a folder of images and robot poses as `recordings import` does; nothing is written.
 
     What is not given is found: board and mount by dataset.yaml, images or names, the convention of the
     numbers and the square by the board's motion. poses: their file or folder, where others may be meant.
+    images: those of one camera or session: their folder, or their name with # for digits. Where several sets
+    fit and none is named, AmbiguousSourceError holds the choices.
     Raises RecordingError, which names what decides.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise ImportSourceError("no-folder", path=folder)
-    if is_described(folder, board, mount, convention, poses):
+    if is_described(folder, board, mount, convention, poses, images):
         described = read_described(folder)
         known, rows = described.dataset, described.rows
     else:
         told = read_dataset(folder / DATASET_FILE)[0] if (folder / DATASET_FILE).is_file() else None
-        given = Given(convention, mount, None if board is None else _board(board))
+        given = Given(convention, mount, None if board is None else _board(board), images)
         believed = believe(look(folder, None if poses is None else Path(poses)), given, told)
         known, rows = believed.dataset, believed.rows
     if any(row.camera_from_board is not None for row in rows):

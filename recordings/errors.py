@@ -16,18 +16,21 @@ from typing import Any, Self
 
 from recordings.plain_text import bytes_text
 
-Value = str | float | int | bool | None
+Value = str | float | int | bool | list[str] | None
 
 
 def plain_value(value: object) -> Value:
     """Convert a value by its type to one that every message and file can hold.
 
-    A path becomes its text, a NumPy scalar the Python number that it holds, anything unknown its text.
+    A path becomes its text, a NumPy scalar the Python number that it holds, a list one of texts, anything
+    unknown its text.
     """
     if value is None or type(value) in (str, float, int, bool):
         return value  # type: ignore[return-value]  # by the line above
     if isinstance(value, Path):
         return str(value)
+    if isinstance(value, list):
+        return [str(each) for each in value]
     number = getattr(value, "item", None)
     if callable(number) and getattr(value, "ndim", None) == 0:
         return plain_value(number())
@@ -132,6 +135,8 @@ class _Sentence(Formatter):
         return values.get(name, f"{{{name}}}"), name
 
     def format_field(self, value: Any, form: str) -> str:
+        if isinstance(value, list):
+            return "; ".join(value)
         unit = next((unit for unit in _UNITS if form.endswith(unit)), "")
         try:
             if form == "bytes":
@@ -177,6 +182,13 @@ class ImportSourceError(RecordingError):
     """Data to import that lack something or are wrong."""
 
     code = "import-source"
+
+
+class AmbiguousSourceError(ImportSourceError):
+    """Several things may be meant: values `sets`, and `choices`, which are what `option` takes for each."""
+
+    code = "several-sets"
+    exit_code = 2
 
 
 def disk_error(doing: str, path: Path, error: OSError, advice: str = "") -> RecordingError:

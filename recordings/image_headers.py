@@ -14,6 +14,14 @@ SIDE_LIMIT_PX = 16384
 LFS_POINTER = b"version https://git-lfs"
 """Beginning of what stands in a repository in place of a large file that was not fetched."""
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+TIFF_MAGICS = (b"II*\0", b"MM\0*")
+_TIFF_WIDTH = 256
+_TIFF_HEIGHT = 257
+_TIFF_BITS = 258
+_TIFF_CHANNELS = 277
+_TIFF_ENTRY_BYTES = 12
+_TIFF_KINDS = {3: "H", 4: "I"}
+"""Kinds of whole numbers that tell sizes."""
 _JPEG_SIZES = {0xC0, 0xC1, 0xC2}
 """Baseline, extended and progressive; the other start-of-frame kinds no camera writes."""
 
@@ -28,7 +36,7 @@ class ImageError(ValueError):
 @dataclass(frozen=True)
 class ImageHeader:
     format: str
-    """png, jpeg, bmp or pgm"""
+    """png, jpeg, bmp, pgm or tiff"""
     width: int
     height: int
     channels: int
@@ -52,10 +60,12 @@ def read_header(data: bytes) -> ImageHeader:
     elif match := re.match(rb"P5\s+(\d{1,6})\s+(\d{1,6})\s+(\d{1,5})\s", data[:64]):
         width, height, top = (int(g) for g in match.groups())
         header = ImageHeader("pgm", width, height, 1, 1 if top < 256 else 2)
+    elif data.startswith(TIFF_MAGICS):
+        header = _tiff_header(data)
     elif data.startswith(LFS_POINTER):
         raise ImageError("is a pointer of Git LFS: fetch the images with `git lfs pull`")
     else:
-        raise ImageError("neither PNG, JPEG, BMP nor PGM")
+        raise ImageError("neither PNG, JPEG, BMP, PGM nor TIFF")
     if not (0 < header.width <= SIDE_LIMIT_PX and 0 < header.height <= SIDE_LIMIT_PX):
         raise ImageError(f"impossible size {header.width}×{header.height}")
     if header.decoded_bytes > IMAGE_LIMIT_BYTES:
@@ -72,6 +82,29 @@ def _png_header(data: bytes) -> ImageHeader:
     width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
     channels = 1 if colour in (0, 4) else 3
     return ImageHeader("png", width, height, channels, 2 if depth == 16 else 1)
+
+
+def _tiff_header(data: bytes) -> ImageHeader:
+    """Of the first image of the file; its description may stand behind its pixels."""
+    order = "<" if data.startswith(b"II") else ">"
+    told = {_TIFF_BITS: 1, _TIFF_CHANNELS: 1}
+    try:
+        (at,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, at)
+        for entry in range(at + 2, at + 2 + count * _TIFF_ENTRY_BYTES, _TIFF_ENTRY_BYTES):
+            tag, kind, values = struct.unpack_from(f"{order}HHI", data, entry)
+            if kind not in _TIFF_KINDS:
+                continue
+            form = _TIFF_KINDS[kind]
+            place = entry + 8
+            if values * struct.calcsize(form) > 4:  # behind an address, one for each channel
+                (place,) = struct.unpack_from(f"{order}I", data, place)
+            (told[tag],) = struct.unpack_from(f"{order}{form}", data, place)
+        width, height = told[_TIFF_WIDTH], told[_TIFF_HEIGHT]
+    except (struct.error, KeyError) as error:
+        raise ImageError("the TIFF has no header, or is cut") from error
+    channels = 1 if told[_TIFF_CHANNELS] == 1 else 3
+    return ImageHeader("tiff", width, height, channels, 2 if told[_TIFF_BITS] > 8 else 1)
 
 
 def _jpeg_header(data: bytes) -> ImageHeader:

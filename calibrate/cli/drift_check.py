@@ -197,7 +197,8 @@ def _require_this_cell(
     except OtherCellError as other:
         own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
         if version is not None and own and other.device:
-            reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))
+            values = {name: value for name, value in other.values.items() if not isinstance(value, list)}
+            reason = ValidityReason(f"{other.device}-changed", other.text, values)
             note_check(root, reason, False, True, _taken(info), camera=camera, version=version)
         raise
 

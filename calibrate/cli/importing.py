@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shlex
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +13,13 @@ from typing import Annotated
 
 import msgspec
 import typer
+from rich.console import Console
 
 from calibrate.boards.model import typed_board
 from calibrate.imported import Given, believe, is_described
 from calibrate.job import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
+from recordings.errors import AmbiguousSourceError
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, import_bag
 from recordings.importers.bags import BAGS, UNFINISHED
@@ -48,6 +51,10 @@ def import_command(
     ] = None,
     poses: Annotated[
         Path | None, typer.Option(help="The robot's poses: a file, a folder, or the end of a table's name.")
+    ] = None,
+    images: Annotated[
+        str | None,
+        typer.Option(help="Which images: a folder, or the end of their name with # for digits."),
     ] = None,
     convention: Annotated[
         str | None,
@@ -93,27 +100,58 @@ def import_command(
     target = None if dry_run else output
     console = plain_console(stderr=True)
     shown = console.is_terminal and not as_json
-    with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
-        if is_described(source, dataset, poses, convention, mount, board):
-            done = import_folder(source, target, progress)
-        elif source.exists() and not (
-            source.name.endswith(UNFINISHED)  # beside pictures it is only left over
-            or any(path.suffix in BAGS for path in [source, *source.glob("*")])
-        ):
-            held = look(source, poses)
-            told = read_dataset(dataset)[0] if dataset else _told(held.root, output)
-            given = Given(convention, mount, None if board is None else typed_board(board))
-            done = _import_found(held, target, told, given, progress)
-        else:
-            wanted = Wanted(image_topic, pose_topic, base, flange, joint_topic)
-            limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
-            done = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
+    told = {"--poses": None if poses is None else str(poses), "--images": images}
+    done: Imported | None = None
+    while done is None:
+        try:
+            with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
+                if is_described(source, dataset, poses, images, convention, mount, board):
+                    done = import_folder(source, target, progress)
+                elif _is_folder_of_anyone(source):
+                    held = look(source, None if told["--poses"] is None else Path(told["--poses"]))
+                    description = read_dataset(dataset)[0] if dataset else _told(held.root, output)
+                    size_told = None if board is None else typed_board(board)
+                    given = Given(convention, mount, size_told, told["--images"])
+                    done = _import_found(held, target, description, given, progress)
+                else:
+                    wanted = Wanted(image_topic, pose_topic, base, flange, joint_topic)
+                    limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
+                    done = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
+        except AmbiguousSourceError as several:
+            if not (shown and sys.stdin.isatty()):
+                raise
+            told[str(several.values["option"])] = _asked(several, console)
     size_bytes = target.stat().st_size if target else 0
-    facts = ImportJson(str(target or ""), done.images, size_bytes, done.facts)
+    facts = ImportJson(str(target or ""), done.images, size_bytes, done.facts, done.unused)
     if as_json:
         print_json(facts)
     else:
         _print_import(facts)
+
+
+def _is_folder_of_anyone(source: Path) -> bool:
+    """Tell whether there is something that is no bag."""
+    if not source.exists():
+        return False
+    # an unfinished recording beside pictures is only left over
+    has_bag = any(path.suffix in BAGS for path in [source, *source.glob("*")])
+    return not (source.name.endswith(UNFINISHED) or has_bag)
+
+
+def _asked(several: AmbiguousSourceError, console: Console) -> str:
+    """What the person at the terminal chooses."""
+    sets, choices = several.values["sets"], several.values["choices"]
+    assert isinstance(sets, list)
+    assert isinstance(choices, list)
+    console.print(plain_text(f"{several.text}"))
+    for number, each in enumerate(sets, 1):
+        console.print(plain_text(f"{number:>3}  {each}"))
+    number = 0
+    while not 1 <= number <= len(choices):
+        number = typer.prompt(f"Which one (1 to {len(choices)})", type=int, err=True)
+    chosen = choices[number - 1]
+    console.print(plain_text(f"as {several.values['option']} {shlex.quote(chosen)}"))
+    return chosen
 
 
 def _told(source: Path, output: Path | None) -> Dataset | None:
@@ -137,7 +175,11 @@ def _import_found(
     done = write_views(held.root, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
     if target is not None and dataset != told:
         write_atomically(target.with_suffix("." + DATASET_FILE), content)
-    return replace(done, facts=believed.facts)
+    return replace(done, facts=believed.facts, unused=believed.unused)
+
+
+_UNUSED_LINES = 12
+"""Most kinds of unused files that are printed."""
 
 
 class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -149,12 +191,18 @@ class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
     bytes: int
     found: dict[str, tuple[str, str]] = {}
     """What → (what is believed, its evidence)."""
+    not_used: list[str] = []
+    """Files that were seen and not used, one line a kind."""
 
 
 def _print_import(facts: ImportJson) -> None:
     """Print what `recordings import` took, or would take."""
     for what, (believed, evidence) in facts.found.items():
         print(plain_text(f"{what:<11}{believed:<41} {evidence}".rstrip()))
+    for n, line in enumerate(facts.not_used[:_UNUSED_LINES]):
+        print(plain_text(f"{'' if n else 'not used':<11}{line}"))
+    if len(facts.not_used) > _UNUSED_LINES:
+        print(f"{'':<11}{len(facts.not_used) - _UNUSED_LINES} more kinds of files; --json names all")
     if not facts.recording:
         print(plain_text(f"{facts.views} views would be taken; nothing was written"))
         return

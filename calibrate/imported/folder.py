@@ -2,28 +2,47 @@
 
 from __future__ import annotations
 
-import re
+from collections import Counter, defaultdict
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from calibrate.boards.model import describe_board
-from calibrate.imported.board import FEWEST, GUESSED_M, Key, Seen, see_board, told_boards
+from calibrate.geometry import inverse
+from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boards
 from calibrate.imported.mounting import joints_of, joints_rad, mounting
+from calibrate.imported.sets import (
+    ImageSet,
+    PairSet,
+    are_rivals,
+    are_sessions,
+    image_sets,
+    pair_sets,
+    pairs_of,
+    same_pictures,
+)
 from calibrate.imported.table_readings import TableReading, decide, is_good, table_readings
-from recordings.errors import ImportSourceError
+from recordings.errors import AmbiguousSourceError, ImportSourceError
+from recordings.image_headers import ImageError, read_header
 from recordings.importers.conventions import Convention, convention, tells_direction
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
+from recordings.importers.image_files import header_bytes
 from recordings.importers.messages import Progress
-from recordings.importers.tables import Contents, Table, natural
+from recordings.importers.tables import Contents, Table
+from recordings.importers.trees import DATA_SUFFIXES
 from recordings.schema.messages import LARGEST_TOLERANCE, BoardSpec, CameraModel, Matrix4, Mount
 
 LEAST_GUESSED_TOLERANCE = 0.003
 """Relative: no guess from some images is nearer than what a board is printed to."""
-_MADE = re.compile(r"draw|calibrated|overlay|visual|detect|result|undist|depth|corner|IR\b|axes", re.I)
-"""Names of images that a program painted on, or that another camera took."""
+_SAME = 2e-3
+"""Two results that differ less, metres and radians, are of one camera."""
+_SEVERAL = 2
+_LISTED = 8
+"""Most names of files and tables in an error."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +52,8 @@ class Given:
     convention: str | None = None
     mount: Mount | None = None
     board: BoardSpec | None = None
+    images: str | None = None
+    """A folder or file, the end of the images' name with digits as #, or the table of the board's poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +64,8 @@ class Believed:
     rows: list[PoseRow]
     facts: dict[str, tuple[str, str]] = field(default_factory=dict)
     """What → (what is believed, its evidence), for people."""
+    unused: list[str] = field(default_factory=list)
+    """Files that were seen and not used, one line a kind, for people."""
 
 
 def is_described(folder: Path, *given: object) -> bool:
@@ -64,87 +87,167 @@ def believe(
     `told`: a description of before; where it names table and convention it is taken as it is, unless more is
     given.
     """
+    board_told = given.board is not None
     if told is not None:
-        if told.poses is not None and given == Given():
+        if told.poses is not None and given == Given() and held.told is None:
             return _as_before(held, told, told.poses)
-        given = Given(given.convention, given.mount or told.mount, given.board or told.board)
-    named, unnamed = ([t for t in held.tables if t.whose == whose] for whose in ("robot", ""))
-    robots = named or unnamed
-    if held.told is not None:  # a file that is told may hold the board's poses, too
-        robots = [table for table in held.told if table.whose != "board"] or held.told
-    boards = [
-        (robot, board, pairs)
-        for robot in robots
-        for board in held.tables
-        if (board.whose == "board" or (held.told and board in unnamed)) and board not in robots
-        if len(pairs := _pairs(robot, board)) >= FEWEST
-    ]
+        given = replace(given, mount=given.mount or told.mount, board=given.board or told.board)
+    robots = _robots(held)
+    sets = image_sets(held, robots, given.images)
+    good: list[tuple[ImageSet, list[TableReading]]] = []
     tried: list[TableReading] = []
-    families: list[str] = []
-    seen: Seen | None = None
-    for family in sorted(held.images, key=lambda name: (bool(_MADE.search(name)), name)):
-        paired = [(table, _pairs(table, held.images[family])) for table in robots]
-        paths = {path for _, pairs in paired if len(pairs) >= FEWEST for path in pairs}
-        if not paths:
-            continue
-        families.append(family)
-        images = sorted((path for path in paths if isinstance(path, Path)), key=natural)
-        if (seen := see_board(held, given.board, images, progress)) is not None:
-            for table, pairs in paired:
-                tried += table_readings(table, family, pairs, [seen], given.convention)
-        if any(map(is_good, tried)):
+    problem: ImportSourceError | None = None
+    board_seen = False
+    for each in sets:
+        if good and each.is_made:
             break
-    else:
-        for n, (robot, board, pairs) in enumerate(boards):
-            progress(n, len(boards), "comparing tables of poses")
-            tried += table_readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
-    if not tried and (seen or not families):
-        there = [f"{name}, {todo}" for name, todo in held.unread.items()]
-        there += [f"{len(paths)} {name}" for name, paths in held.images.items()]
-        tables = [f"{len(table.numbers)} {table.name}" for table in held.tables]
-        said = [", ".join(each[:8]) or "none" for each in (there, tables)]
-        raise ImportSourceError("no-pairs", source=held.root, images=said[0], tables=said[1])
+        if any(same_pictures(each.paths, other.paths) for other, _ in good):
+            continue
+        if (sizes := _sizes(each.paths)) is not None:
+            problem = ImportSourceError("image-sizes", source=held.root, images=each.family, sizes=sizes)
+            continue
+        readings: list[TableReading] = []
+        if (seen := see_board(held, given.board, each.paths, progress)) is not None:
+            board_seen = True
+            for table, pairs in each.rows:
+                readings += table_readings(table, each.family, pairs, [seen], given.convention)
+        tried += readings
+        if any(map(is_good, readings)):
+            good.append((each, readings))
+        if len(good) > 1:
+            rivals = [other for other in sets if not other.is_made]
+            raise _several(held, [(other.family, _row_names(other)) for other in rivals])
+    if good:
+        tried = good[0][1]
+    elif problem is not None:
+        raise problem
+    elif not (sets and (given.board or given.images)):
+        pair_readings = _pair_readings(held, robots, given, progress)
+        if pair_readings and board_told:
+            raise ImportSourceError("told-not-used", source=held.root, option="--board", instead="pairs")
+        tried += pair_readings
+    if not tried and (board_seen or not sets):
+        raise _no_pairs(held, robots)
     if not tried:
-        sought = "board" if given.board is None else describe_board(given.board)
-        raise ImportSourceError("no-board-found", source=held.root, board=sought, images=", ".join(families))
+        families = ", ".join(each.family for each in sets)
+        if given.board is None:
+            raise ImportSourceError("no-board-found", source=held.root, board="board", images=families)
+        said = describe_board(given.board)
+        raise ImportSourceError("told-board-unseen", source=held.root, board=said, images=families)
     return _believed(held, given, decide(held, tried, given.convention, given.mount))
+
+
+def _robots(held: Contents) -> list[Table]:
+    """Tables that may be the robot's. ImportSourceError where those that the user names are not there."""
+    named, unnamed = ([t for t in held.tables if t.whose == whose] for whose in ("robot", ""))
+    if held.told is None:
+        return named or unnamed
+    if not held.told:
+        there = _listed([f"{len(table.numbers)} {table.name}" for table in held.tables])
+        told = {"option": "--poses", "told": held.told_as, "there": there}
+        raise ImportSourceError("told-not-there", source=held.root, **told)
+    # a file that is told may hold the board's poses, too
+    return [table for table in held.told if table.whose != "board"] or held.told
+
+
+def _pair_readings(
+    held: Contents, robots: list[Table], given: Given, progress: Progress
+) -> list[TableReading]:
+    """Readings of the one set of tables that is good, else of all. ImportSourceError where several are."""
+    boards = [t for t in held.tables if t.whose == "board" or (held.told and t.whose == "")]
+    sets = pair_sets(robots, boards)
+    good: list[tuple[PairSet, list[TableReading]]] = []
+    tried: list[TableReading] = []
+    for n, each in enumerate(sets):
+        progress(n, len(sets), "comparing tables of poses")
+        seens = list(told_boards(each.board))
+        readings = [*table_readings(each.robot, each.board.name, each.pairs, seens, given.convention)]
+        tried += readings
+        if any(map(is_good, readings)):
+            good.append((each, readings))
+    for (one, readings), (other, other_readings) in combinations(good, 2):
+        differ = are_rivals(one, other) and not _same_cell(_best(readings), _best(other_readings))
+        if differ or are_sessions(one, other):
+            raise _several(held, [(each.board.name, each.robot.name) for each, _ in good])
+    return tried
+
+
+def _best(readings: list[TableReading]) -> TableReading:
+    return max(filter(is_good, readings), key=lambda reading: reading.fit.log_evidence)
+
+
+def _same_cell(one: TableReading, other: TableReading) -> bool:
+    """Tell whether two readings find the same camera or board: of the same poses, or of their inverses."""
+    places = [T for X in (one.fit.X[0], one.fit.Y[0]) for T in (X, inverse(X))]
+    return any(np.abs(T - other.fit.X[0]).max() < _SAME for T in places)
+
+
+def _several(held: Contents, sets: list[tuple[str, str]]) -> AmbiguousSourceError:
+    """Which of several sets is meant; `sets`: images, or poses of the board, and the robot's poses beside."""
+    return AmbiguousSourceError(
+        "several-sets",
+        source=held.root,
+        sets=[f"{seen} with {robot}" for seen, robot in sets],
+        option="--images",
+        choices=[seen for seen, _ in sets],
+    )
+
+
+def _row_names(images: ImageSet) -> str:
+    return " or ".join(table.name for table, _ in images.rows)
+
+
+def _no_pairs(held: Contents, robots: list[Table]) -> ImportSourceError:
+    """Why nothing goes together."""
+    there = [f"{name}, {todo}" for name, todo in held.unread.items()]
+    there += [f"{len(paths)} {name}" for name, paths in held.images.items()]
+    tables = [f"{len(table.numbers)} {table.name}" for table in held.tables]
+    said = {"images": _listed(there), "tables": _listed(tables)}
+    unnamed = [table for table in held.tables if table.whose == ""]
+    alike = [table for table in unnamed if any(_as_long(table, other) for other in unnamed)]
+    if held.told is not None:
+        said["tables"] = _listed([f"{len(table.numbers)} {table.name}" for table in robots])
+        return ImportSourceError("told-poses-unpaired", source=held.root, **said)
+    if alike and not held.images:
+        names = [f"{len(table.numbers)} rows of {table.name}" for table in alike]
+        choices = [table.name for table in alike]
+        return AmbiguousSourceError(
+            "which-poses", source=held.root, sets=names, option="--poses", choices=choices
+        )
+    return ImportSourceError("no-pairs", source=held.root, **said)
+
+
+def _as_long(table: Table, other: Table) -> bool:
+    return table is not other and len(table.numbers) == len(other.numbers) >= FEWEST
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:_LISTED]) or "none"
+
+
+def _sizes(paths: list[Path]) -> str | None:
+    """The sizes of images where they are several, the most frequent first, each with an image; None: one."""
+    sizes = defaultdict[tuple[int, int], list[Path]](list)
+    for path in paths:
+        with suppress(OSError, ImageError):  # what is damaged is told where it is looked at
+            header = read_header(header_bytes(path))
+            sizes[header.width, header.height].append(path)
+    if len(sizes) < _SEVERAL:
+        return None
+    ranked = sorted(sizes.items(), key=lambda each: -len(each[1]))
+    return ", ".join(f"{len(each)} of {w}×{h} ({each[0].name})" for (w, h), each in ranked)
 
 
 def _as_before(held: Contents, told: Dataset, poses: PosesTold) -> Believed:
     tables = {table.name: table for table in held.tables}
     table, board = tables.get(poses.table), tables.get(poses.images) if poses.board_convention else None
-    if table is None or not (pairs := _pairs(table, board or held.images.get(poses.images, []))):
+    if table is None or not (pairs := pairs_of(table, board or held.images.get(poses.images, []))):
         raise ImportSourceError("no-pairs", source=held.root, images=poses.images, tables=poses.table)
     seen = None if board is None else (board, convention(poses.board_convention))
     joints = tables.get(poses.joints)
     if poses.joints and (joints is None or len(joints.numbers) != len(table.numbers)):
         raise ImportSourceError("joints-rows", source=held.root, joints=poses.joints, poses=poses.table)
     return Believed(told, _rows(held, table, convention(poses.convention), pairs, seen, joints))
-
-
-def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
-    """Image → row: by the names told beside the rows, by the numbers in both names, or by order.
-
-    Row of a table of the board's poses → row of the robot's: by order.
-    """
-    if isinstance(paths, Table):
-        return {row: row for row in range(len(paths.numbers)) if len(paths.numbers) == len(table.numbers)}
-    named = {Path(name).name: row for row, name in enumerate(table.images) if name}
-    by_name: dict[Key, int] = {path: named[path.name] for path in paths if path.name in named}
-    if by_name:
-        return by_name
-    ordered = sorted(paths, key=natural)
-    if len(paths) == len(table.numbers):
-        return {path: row for row, path in enumerate(ordered)}
-    numbers = {path: int(found[-1]) for path in paths if (found := re.findall(r"\d+", path.stem))}
-    rows = {place[-1]: row for row, place in enumerate(table.places) if place}
-    if "#" not in table.name:  # some images are gone, neither the first nor the last
-        first, last = min(numbers.values(), default=0), max(numbers.values(), default=0)
-        counted = first in (0, 1) and last - first + 1 == len(table.numbers)
-        rows = {first + row: row for row in range(len(table.numbers))} if counted else {}
-    shared: dict[Key, int] = {path: rows[number] for path, number in numbers.items() if number in rows}
-    unique = len(rows) == len(table.numbers) and len(set(numbers.values())) == len(numbers)
-    return shared if unique and len(shared) > 0.8 * max(len(rows), len(paths)) else {}
 
 
 def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
@@ -177,7 +280,38 @@ def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
     seen_how, moved_by = saw[1].name if saw else "", joints.name if joints else ""
     told = PosesTold(best.table.name, best.family, how.name, seen_how, moved_by, str(held.root.resolve()))
     dataset = Dataset(mount, board, camera, held.root.resolve().name, poses=told)
-    return Believed(dataset, _rows(held, best.table, how, pairs, saw, joints), facts)
+    used = {best.table.files, saw[0].files if saw else best.family, *([joints.files] if joints else [])}
+    describes = seen.camera_known or (seen.square_known and not saw)
+    unused = _unused(held, used | (held.described_by if describes else set()))
+    return Believed(dataset, _rows(held, best.table, how, pairs, saw, joints), facts, unused)
+
+
+def _unused(held: Contents, used: set[str]) -> list[str]:
+    """Files that were seen and not used, one line a kind: data by name, what is never read by suffix."""
+    tables = {table.files for table in held.tables}
+    lines: list[str] = []
+    others = Counter[str]()
+    for name, count in held.files.items():
+        if name in used:
+            continue
+        counted = f"{count} {name}" if count > 1 else name
+        if name in held.unread:
+            lines.append(f"{counted}: {held.unread[name]}")
+        elif name in held.images:
+            lines.append(f"{counted}: images")
+        elif name in tables:
+            lines.append(f"{counted}: numbers like poses")
+        elif name in held.described_by:
+            lines.append(f"{counted}: says something of a board or camera")
+        elif Path(name).suffix in DATA_SUFFIXES:
+            lines.append(f"{counted}: no table of poses, no board, no camera")
+        else:
+            others[Path(name).suffix or Path(name).name] += count
+    lines += [f"{name}, {todo}" for name, todo in held.unread.items() if name not in held.files]
+    if others:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in others.most_common())
+        lines.append(f"never read: {kinds}")
+    return lines
 
 
 _USUAL_SQUARES_MM = (

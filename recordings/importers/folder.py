@@ -30,6 +30,8 @@ class Imported:
     images: int
     facts: dict[str, tuple[str, str]] = field(default_factory=dict)
     """What → (what is believed, its evidence), for people."""
+    unused: list[str] = field(default_factory=list)
+    """Files that were seen and not used, one line a kind, for people."""
 
 
 def import_folder(

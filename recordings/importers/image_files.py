@@ -9,7 +9,7 @@ from typing import Any
 
 from recordings.errors import ImportSourceError, wrong_size_error
 from recordings.files import read_beginning
-from recordings.image_headers import ImageError, read_header
+from recordings.image_headers import IMAGE_LIMIT_BYTES, TIFF_MAGICS, ImageError, read_header
 from recordings.importers.dataset import POSES_FILE
 
 _HEADER_BYTES = 1024 * 1024
@@ -28,6 +28,13 @@ def check_headers(folder: Path, images: Iterable[tuple[int, str]], size: tuple[i
     return newest_ns
 
 
+def header_bytes(path: Path, limit_bytes: int = _HEADER_BYTES) -> bytes:
+    """The beginning of an image file in which its size stands. OSError where it cannot be read."""
+    data = read_beginning(path, limit_bytes)
+    # a TIFF's size may stand behind its pixels
+    return read_beginning(path, IMAGE_LIMIT_BYTES + 1) if data.startswith(TIFF_MAGICS) else data
+
+
 def read_checked(
     folder: Path, line: int, image: str, size: tuple[int, int], limit_bytes: int
 ) -> tuple[str, bytes]:
@@ -40,7 +47,7 @@ def read_checked(
         told, parent = os.path.normpath(image), os.path.realpath(path.parent)  # a folder may be a link
         if told.startswith(("..", "/")) or not Path(os.path.realpath(path)).is_relative_to(parent):
             raise ImportSourceError("outside", **place)
-        data = read_beginning(path, limit_bytes)
+        data = header_bytes(path, limit_bytes)
         header = read_header(data)
     except OSError as error:
         raise ImportSourceError("unreadable", **place, reason=error.strerror) from error

@@ -292,7 +292,7 @@ def _contents(found: FolderRead, blobs: list[bytes]) -> Contents:
     tables = []
     for table, blob in zip(found.tables, blobs, strict=True):
         numbers = np.frombuffer(bytearray(blob)).reshape(len(table.images), table.columns)
-        tables.append(Table(table.name, table.rotation, numbers, table.images, table.places))
+        tables.append(Table(table.name, table.rotation, numbers, table.images, table.places, table.files))
     return Contents(
         root=Path(found.root),
         images={alike: list(map(Path, paths)) for alike, paths in found.images.items()},
@@ -300,6 +300,9 @@ def _contents(found: FolderRead, blobs: list[bytes]) -> Contents:
         cameras=[(np.array(matrix), distortion) for matrix, distortion in found.cameras],
         facts=dict(found.facts),
         words=found.words,
+        files=found.files,
+        described_by=found.described_by,
         unread=found.unread,
         told=None if found.told is None else [tables[place] for place in found.told],
+        told_as=found.told_as,
     )

@@ -115,14 +115,19 @@ def _look(request: LookInto, reading: Callable[[Path], None]) -> Frame:
         root=str(found.root),
         images={alike: list(map(str, paths)) for alike, paths in found.images.items()},
         tables=[
-            TableRead(table.name, table.rotation, table.numbers.shape[1], table.images, table.places)
+            TableRead(
+                table.name, table.rotation, table.numbers.shape[1], table.images, table.places, table.files
+            )
             for table in found.tables
         ],
         cameras=[(matrix.tolist(), distortion) for matrix, distortion in found.cameras],
         facts=found.facts,
         words=found.words,
+        files=found.files,
+        described_by=found.described_by,
         unread=found.unread,
         told=None if found.told is None else [found.tables.index(table) for table in found.told],
+        told_as=found.told_as,
     )
     return answer, [table.numbers.tobytes() for table in found.tables]
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
+from recordings.errors import Value
 from recordings.importers.dataset import Dataset
 from recordings.schema.messages import Joints, RobotState, SessionInfo, Stamps, View
 
@@ -82,7 +83,7 @@ class Refused(msgspec.Struct, frozen=True, tag=True):
     code: str
     text: str
     remedy: str
-    values: dict[str, str | float | int | bool | None]
+    values: dict[str, Value]
 
 
 class Broken(msgspec.Struct, frozen=True, tag=True):
@@ -101,6 +102,7 @@ class TableRead(msgspec.Struct, frozen=True):
     columns: int
     images: list[str]
     places: list[tuple[int, ...]]
+    files: str
 
 
 class FolderRead(msgspec.Struct, frozen=True, tag=True):
@@ -112,9 +114,12 @@ class FolderRead(msgspec.Struct, frozen=True, tag=True):
     cameras: list[tuple[list[list[float]], tuple[float, ...]]]
     facts: dict[str, str | int | float | bool | list[float] | None]
     words: str
+    files: dict[str, int]
+    described_by: set[str]
     unread: dict[str, str]
     told: list[int] | None
     """Places in `tables`."""
+    told_as: str
 
 
 class PoseRead(msgspec.Struct, frozen=True):

@@ -26,11 +26,17 @@ if TYPE_CHECKING:  # messages of bags load more than a folder needs
     from recordings.importers.messages import Array
 
 _FILES_LIMIT = 5000
+_FEWEST_ROWS = 3
+_TWO = 2
+_FEWEST_FOLDERS = 3
+"""Fewest folders of which each may hold one pose."""
 _FOLDERS_LIMIT = 5000
 _VALUES_LIMIT = 200_000
 """Values and brackets of one file."""
 _NUMBER_LIMIT = 1e6
 """No arm is a kilometre long, in whatever unit."""
+_STAMP_LEAST = 1e8
+"""Seconds since 1970 are more, and numbers of a pose are less."""
 _TEXT_LIMIT = 200
 """Letters of a key or a text that are looked at: poses and boards are described in fewer."""
 _DIGITS_LIMIT = 18
@@ -39,7 +45,17 @@ _WORDS_LIMIT = 20_000
 _UNREAD = {
     "to be unpacked first": (".zip", ".tar", ".tgz", ".gz", ".7z", ".rar"),
     "to be saved as CSV first": (".xlsx", ".xls", ".ods", ".pkl", ".pickle"),
+    "a robot program: its poses to be written as CSV first, one a line": (
+        *(".mod", ".sys"),  # ABB
+        *(".src", ".krl"),  # KUKA
+        *(".ls", ".tp"),  # Fanuc
+        *(".jbi", ".as", ".pg", ".urp", ".pac", ".pgx", ".dtx"),
+    ),
 }
+_PROGRAM = next(todo for todo, suffixes in _UNREAD.items() if ".mod" in suffixes)
+_KUKA = re.compile(rb"DEFDAT|\bE6POS\b|\bE6AXIS\b")
+_RESULT = "a result of a calibration, which is not read"
+_BEGINNING_BYTES = 64 * 1024
 _HALVES = {
     "position": (re.compile(r"pos|position|trans\w*|tvec|t|xyz|p|location"), (3,)),
     "rotation": (re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues"), (3, 4, 9)),
@@ -54,6 +70,13 @@ _COLUMNS = {
     "ZYX": ("a", "b", "c"),
 }
 """Names of columns behind x, y, z, and the rotation that they name."""
+_IDENTITIES = frozenset(
+    {
+        *("image", "img", "image_id", "image_name", "picture", "photo", "frame"),
+        *("file", "filename", "file_name", "name", "id", "index", "idx"),
+    }
+)
+"""Columns and keys that tell which image a row belongs to."""
 _WHOSE = {
     "other": re.compile(r"detect|joint|result|valid|guess|waiting|intrin", re.I),
     "robot": re.compile(
@@ -62,6 +85,7 @@ _WHOSE = {
     "board": re.compile(r"cam|board|marker|target|track|obj|eye|chess|tag|sensor|[rt]vec", re.I),
 }
 """Words of tables that tell of something else, of the robot's pose, and of the board's."""
+_OF_BOARDS = re.compile(r"board|square|pattern|marker|dictionary|chess|circle|corner|^(columns|rows|cols)$")
 _PART = re.compile(r"(.*?)[_. ]?(q?[xyzw]|r[xyz]|roll|pitch|yaw|[abc]|\d+)")
 """A name of one number among those of a pose: whose pose, and which number."""
 
@@ -80,6 +104,8 @@ class Table:
     """Name of the row's image as told beside it; empty: none."""
     places: list[tuple[int, ...]]
     """Numbers in the row's file name and place, its order."""
+    files: str = ""
+    """The files that hold it, digits that tell rows apart as #."""
 
     @property
     def whose(self) -> str:
@@ -106,10 +132,16 @@ class Contents:
     """Values of leaves that describe a board, by lower-case key."""
     words: str = ""
     """The folder's last names, names of files and keys: what may say how the camera is mounted."""
+    files: dict[str, int] = field(default_factory=dict)
+    """All files, digits that tell them apart as # → how many."""
+    described_by: set[str] = field(default_factory=set)
+    """Those of them that say something of camera or board."""
     unread: dict[str, str] = field(default_factory=dict)
     """Files that are not looked into → what is to be done first."""
     told: list[Table] | None = None
     """The robot's tables that the user names; None: none was named."""
+    told_as: str = ""
+    """How the user names them."""
 
 
 @dataclass
@@ -118,6 +150,7 @@ class _Row:
     image: str
     place: tuple[int, ...]
     told: bool
+    file: str
 
 
 def look(
@@ -130,35 +163,43 @@ def look(
     """
     root = source if source.is_dir() else source.parent
     file = poses if poses is None or poses.exists() else root / poses
-    found, words = Contents(root, told=None if poses is None else []), ["/".join(source.resolve().parts[-3:])]
+    found, words = Contents(root), ["/".join(source.resolve().parts[-3:])]
     rows = defaultdict[tuple[str, ...], list[_Row]](list)
     files = list(islice(_files(source, found.unread), _FILES_LIMIT + 1))
     if len(files) > _FILES_LIMIT:
         found.unread[f"more than {_FILES_LIMIT} files"] = "those that are needed to be put elsewhere first"
     files = sorted(files[:_FILES_LIMIT], key=natural)
+    folded = _folded([path.relative_to(root) for path in files])
     for path in files if file is None or file.is_relative_to(root) else [*files, file]:
+        alike = folded[path.relative_to(root)] if path.is_relative_to(root) else _pattern(path.name)
+        found.files[alike] = found.files.get(alike, 0) + 1
         if path.suffix.lower() in IMAGE_SUFFIXES:
-            alike = str(path.relative_to(root).parent / _pattern(path.name))
             found.images.setdefault(alike, []).append(path)
             continue
         todo = next((todo for todo, suffixes in _UNREAD.items() if path.suffix.lower() in suffixes), "")
-        if _is_pointer(path):
+        if _begins(path, LFS_POINTER):
             todo = "to be fetched first with `git lfs pull`"
+        elif path.suffix.lower() == ".dat" and _is_kuka_program(path):
+            todo = _PROGRAM
         if todo:
-            found.unread[path.name] = todo
-        if path.name.startswith((".", "README", "CMake")):
+            found.unread[alike] = todo
+        if todo or path.name.startswith((".", "README", "CMake")):
             continue
         reading(path)
         try:
-            nodes = list(islice(_nodes(read_tree(path), (), ""), _VALUES_LIMIT + 1))
+            tree = read_tree(path)
+            if _is_result(tree):
+                found.unread[alike] = _RESULT
+                continue
+            nodes = list(islice(_nodes(tree, (), ""), _VALUES_LIMIT + 1))
         except UnreadableArraysError as problem:
-            found.unread[path.name] = f"to be saved as CSV first ({problem})"
+            found.unread[alike] = f"to be saved as CSV first ({problem})"
             continue
         except RecursionError:
-            found.unread[path.name] = "to be saved as CSV first (nested too deeply)"
+            found.unread[alike] = "to be saved as CSV first (nested too deeply)"
             continue
         if len(nodes) > _VALUES_LIMIT:
-            found.unread[path.name] = f"to be shortened first: more than {_VALUES_LIMIT} values"
+            found.unread[alike] = f"to be shortened first: more than {_VALUES_LIMIT} values"
             continue
         if not nodes:
             continue
@@ -166,7 +207,8 @@ def look(
         words.append(name)
         told = defaultdict[tuple[str, ...], list[_Row]](list)
         for node in nodes:
-            _facts(node, found)
+            if _facts(node, found):
+                found.described_by.add(alike)
             words.extend(node.keys[-1:])
             if isinstance(node.value, str):
                 words.append(node.value[:60])
@@ -174,22 +216,55 @@ def look(
                 numbers, rotation, half = row
                 place = (*_numbers_in(name), *node.place)
                 key = ".".join(node.keys), rotation, half, str(len(numbers))
-                told[key].append(_Row(numbers, node.image, place, file in (path, *path.parents)))
+                is_told = file in (path, *path.parents)
+                told[key].append(_Row(numbers, node.image, place, is_told, alike))
         for (named, *form), each in told.items():  # files of one row each make a table together
-            rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
+            rows[f"{alike if len(each) == 1 else name} {named}".strip(), *form].extend(each)
     words = words[:_WORDS_LIMIT]
     words += [re.sub("[- ]", "_", word) for word in words]
     found.words = " ".join(dict.fromkeys(words))
+    told_tables: list[Table] = []
     for name, rotation, each in _joined(rows):
-        for part, some in _two_by_two(each).items():
+        for part, some in _parts_of(each).items():
             table = _without_count(np.array([row.numbers for row in some]))
             poses_alike = table.shape[1] in (6, 7, 12, 16) and float(np.abs(table).max()) <= _NUMBER_LIMIT
             if len(some) >= 3 and poses_alike:
                 beside = [row.image for row in some], [row.place for row in some]
-                found.tables.append(Table(f"{name}{part}", rotation, table, *beside))
-                if found.told is not None and (some[0].told or f"{name}{part}".endswith(str(poses))):
-                    found.told.append(found.tables[-1])
+                found.tables.append(
+                    Table(_name_of_part(name, part), rotation, table, *beside, files=some[0].file)
+                )
+                if some[0].told:
+                    told_tables.append(found.tables[-1])
+    if poses is not None:  # what exists is meant before what is named so
+        is_there = file is not None and file.exists()
+        found.told_as = str(poses)
+        found.told = told_tables if is_there else _named_so(found.tables, str(poses))
     return found
+
+
+def _folded(files: list[Path]) -> dict[Path, str]:
+    """Files → their name with digits as #: those with the same one belong together.
+
+    Digits of a folder tell sessions and cameras apart. They are folded only where there is one folder for
+    each pose: at least three folders alike, with one file of the kind in each.
+    """
+    kinds = defaultdict[str, list[Path]](list)
+    for file in files:
+        kinds[str(file.parent / _pattern(file.name))].append(file)
+    folded = {file: kind for kind, each in kinds.items() for file in each}
+    by_pose = defaultdict[str, list[Path]](list)
+    for kind, each in kinds.items():
+        if len(each) == 1:
+            *above, _ = each[0].parts
+            numbered = [level for level, name in enumerate(above) if _pattern(name) != name]
+            if numbered:
+                level = numbered[-1]
+                parts = [*above[:level], _pattern(above[level]), *above[level + 1 :], Path(kind).name]
+                by_pose[str(Path(*parts))].append(each[0])
+    for kind, each in by_pose.items():
+        if len(each) >= _FEWEST_FOLDERS:
+            folded.update(dict.fromkeys(each, kind))
+    return folded
 
 
 def _joined(rows: dict[tuple[str, ...], list[_Row]]) -> Iterator[tuple[str, str, list[_Row]]]:
@@ -214,18 +289,61 @@ def _joined(rows: dict[tuple[str, ...], list[_Row]]) -> Iterator[tuple[str, str,
 
 
 def _without_count(table: Array) -> Array:
-    """The table without a first column of time stamps or running numbers."""
-    first, columns = table[:, 0], table.shape[1]
+    """The table without a first column of time stamps or running numbers, or a last one of time stamps."""
+    last, columns = table[:, -1], table.shape[1]
+    if columns in (7, 8, 13, 17) and last.min() > _STAMP_LEAST and bool((np.diff(last) > 0).all()):
+        return table[:, :-1]
+    first = table[:, 0]
     rises = bool((np.diff(first) > 0).all()) and (columns != 7 or not np.any(first % 1))
     return table[:, 1:] if rises and columns in (7, 8, 13, 17) else table
 
 
-def _two_by_two(rows: list[_Row]) -> dict[str, list[_Row]]:
-    """Rows of a list of pairs, the robot's first, are two tables."""
+def _named_so(tables: list[Table], end: str) -> list[Table]:
+    """Tables of this name, else those whose name ends with it as a whole word, else with its letters."""
+    ways: list[Callable[[str], bool]] = [
+        lambda name: name == end,
+        lambda name: name.endswith(tuple(f"{mark}{end}" for mark in "/ .")),
+        lambda name: name.endswith(end),
+    ]
+    for is_meant in ways:
+        meant = [table for table in tables if is_meant(table.name)]
+        if meant:
+            return meant
+    return []
+
+
+def _parts_of(rows: list[_Row]) -> dict[str, list[_Row]]:
+    """Tables among rows of one name, by what is added to it: a list of pairs, the robot's first, is two.
+
+    So are T1_0, T2_0, T1_1, T2_1 …, by the number that tells the two apart. What is named by two numbers may
+    also be one table, of a grid of places.
+    """
     last = [row.place[-1] if row.place else 0 for row in rows]
     if len(rows) > 4 and last == [0, 1] * (len(rows) // 2):
         return {" robot": rows[::2], " board": rows[1::2]}
-    return {"": rows}
+    parts = {"": rows}
+    lengths = {len(row.place) for row in rows}
+    for column in range(max(lengths)) if len(lengths) == 1 and max(lengths) > 1 else ():
+        two = sorted({row.place[column] for row in rows})
+        if len(two) != _TWO or len(rows) < _TWO * _FEWEST_ROWS:
+            continue
+        first, second = ([row for row in rows if row.place[column] == number] for number in two)
+        rest = [{(*row.place[:column], *row.place[column + 1 :]) for row in each} for each in (first, second)]
+        if rest[0] == rest[1] and len(rest[0]) == len(first) == len(second):
+            parts |= {f"#{column}={two[0]}": first, f"#{column}={two[1]}": second}
+    return parts
+
+
+def _name_of_part(name: str, part: str) -> str:
+    """The name of a table with the number that tells it apart: T#_# → T1_#."""
+    if not part.startswith("#"):
+        return name + part
+    column, _, number = part.removeprefix("#").partition("=")
+    places = [match.start() for match in re.finditer("#", name)]
+    if int(column) >= len(places):
+        return f"{name} {number}"
+    at = places[int(column)]
+    return f"{name[:at]}{number}{name[at + 1 :]}"
 
 
 def _files(source: Path, unread: dict[str, str]) -> Iterator[Path]:
@@ -255,10 +373,25 @@ def _files(source: Path, unread: dict[str, str]) -> Iterator[Path]:
                 yield path
 
 
-def _is_pointer(path: Path) -> bool:
+def _begins(path: Path, beginning: bytes) -> bool:
     with suppress(OSError):
-        return read_beginning(path, len(LFS_POINTER)) == LFS_POINTER
+        return read_beginning(path, len(beginning)) == beginning
     return False
+
+
+def _is_kuka_program(path: Path) -> bool:
+    with suppress(OSError):
+        return _KUKA.search(read_beginning(path, _BEGINNING_BYTES)) is not None
+    return False
+
+
+def _is_result(tree: Any) -> bool:
+    """Tell whether a file is a calibration of ours or of easy_handeye: what came out, not what went in."""
+    if not isinstance(tree, dict):
+        return False
+    ours = str(tree.get("format", "")).startswith("handeye-calibration")
+    easy_handeyes = "transformation" in tree or ("parameters" in tree and "transform" in tree)
+    return ours or (easy_handeyes and "samples" not in tree)
 
 
 def natural(path: Path | str) -> list[Any]:
@@ -284,19 +417,47 @@ class _Node:
 
 def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] = ()) -> Iterator[_Node]:
     """The tree's nodes, those inside of a pose or of its half left out."""
+    if isinstance(tree, dict):
+        image = _image_of(tree) or image
     yield (node := _Node(tree, keys, place, image))
     if (isinstance(tree, list) or _is_matrix(tree)) and (_pose(tree) or _half(node)):
         return
-    if isinstance(tree, dict):
-        named = next((v for v in tree.values() if isinstance(v, str) and IMAGE.fullmatch(v)), image)
-        yield from (_Node(parts, (*keys, stem), place, named) for stem, parts in _stems(tree))
+    if _is_matrix(tree):  # its rows and columns are no board's
+        yield from _nodes(_rows_of_matrix(tree), keys, image, place)
+    elif isinstance(tree, dict):
+        yield from (_Node(parts, (*keys, stem), place, image) for stem, parts in _stems(tree))
         for key, value in tree.items():
-            digits = _numbers_in(str(key))
-            yield from _nodes(value, (*keys, _pattern(str(key)[:_TEXT_LIMIT])), named, (*place, *digits))
+            name = str(key)[:_TEXT_LIMIT]
+            named = name if IMAGE.fullmatch(name) else image
+            yield from _nodes(value, (*keys, _pattern(name)), named, (*place, *_numbers_in(str(key))))
     elif isinstance(tree, list):
         for at, value in enumerate(tree):
             if isinstance(value, (dict, list)):
                 yield from _nodes(value, keys, image, (*place, at))
+
+
+def _image_of(row: dict[str, Any]) -> str:
+    """The name or running number of a row's image as it is told beside its numbers; empty: none."""
+    for value in row.values():
+        if isinstance(value, str) and len(value) <= _TEXT_LIMIT and IMAGE.fullmatch(value):
+            return value
+    for key, value in row.items():
+        if str(key).lower() not in _IDENTITIES or isinstance(value, bool):
+            continue
+        if isinstance(value, str) and 0 < len(value) <= _TEXT_LIMIT:
+            return value
+        if isinstance(value, (int, float)) and abs(value) < _NUMBER_LIMIT and float(value).is_integer():
+            return str(int(value))
+    return ""
+
+
+def _rows_of_matrix(matrix: dict[str, Any]) -> list[Any]:
+    """The rows of OpenCV's matrix where each may be a pose; else nothing to look into."""
+    numbers = _flat(matrix)
+    columns = matrix.get("cols")
+    if not numbers or columns not in POSE_SIZES or len(numbers) % columns:
+        return []
+    return [numbers[at : at + columns] for at in range(0, len(numbers), columns)]
 
 
 def _stems(tree: dict[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -376,19 +537,20 @@ def _half_of(word: str) -> str | None:
     return next((half for half, (words, _) in _HALVES.items() if words.fullmatch(word.strip("#"))), None)
 
 
-def _facts(node: _Node, found: Contents) -> None:
-    """Note a camera's matrix, by its form, and what describes a board."""
+def _facts(node: _Node, found: Contents) -> bool:
+    """Note a camera's matrix, by its form, and what describes a board; returns whether it seems to be so."""
     numbers = _flat(node.value) if isinstance(node.value, (list, dict)) else None
     if numbers and not np.isfinite(numbers).all():
-        return
+        return False
     key = node.keys[-1].lower() if node.keys else ""
+    tells = bool(_OF_BOARDS.search(key))
     if numbers and len(numbers) >= 9:
         K = np.array(numbers[:9]).reshape(3, 3)
         if K[0, 0] > 100 and K[1, 1] > 100 and not K[1, 0] and np.allclose(K[2], [0, 0, 1]):
             beside = tuple(numbers[9:14]) if len(numbers) in (13, 14) else ()
             if not any(np.allclose(K, other) for other, _ in found.cameras):
                 found.cameras.append((K, beside))
-            return
+            return True
     if numbers and "dist" in key and len(numbers) in (4, 5, 8) and found.cameras and not found.cameras[-1][1]:
         found.cameras[-1] = found.cameras[-1][0], tuple(numbers)
     if isinstance(node.value, dict):
@@ -397,6 +559,7 @@ def _facts(node: _Node, found: Contents) -> None:
         if lens and len(lens) == 4 and np.isfinite(lens).all() and not found.cameras:
             fx, fy, cx, cy = lens
             found.cameras.append((np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), ()))
+            tells = True
     if isinstance(node.value, str):
         found.facts.setdefault(key, node.value[:_TEXT_LIMIT])
     elif isinstance(node.value, (dict, list)):
@@ -404,3 +567,4 @@ def _facts(node: _Node, found: Contents) -> None:
             found.facts.setdefault(key, numbers)
     elif node.value is None or isinstance(node.value, bool) or abs((_flat(node.value) or [np.inf])[0]) < 1e15:
         found.facts.setdefault(key, node.value)
+    return tells

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import re
@@ -21,9 +22,11 @@ from recordings.files import read_file
 _BYTES_LIMIT, _ARRAY_LIMIT_BYTES = 4 * 1024 * 1024, 128 * 1024
 _UNPACKED_LIMIT_BYTES = 4 * 1024 * 1024
 """Of an archive of arrays."""
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 _YAML = (".yaml", ".yml", ".samples", ".calib")
-_SUFFIXES = (*_YAML, ".json", ".xml", ".csv", ".txt", ".dat", ".tsv", ".script")
+_ARRAYS = (".npy", ".npz", ".mat")
+DATA_SUFFIXES = (*_YAML, *_ARRAYS, ".json", ".xml", ".csv", ".txt", ".dat", ".tsv", ".script")
+"""Of files that are looked into."""
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d++(?:\.\d*+)?+|\.\d++)(?:[eE][-+]?\d++)?+(?![\w.])")
 _OF_A_NAME = r"[^\s,;'\"\[\]]"
 IMAGE = re.compile(
@@ -31,6 +34,16 @@ IMAGE = re.compile(
 )
 """A name of an image. Like the number, it is looked for from the beginning of a word, not from each of its
 letters: the time grows with the line's length, not with its square."""
+_DAY = r"(?:\d{4}([-/.])\d{1,2}\1\d{1,2}|\d{1,2}([-/.])\d{1,2}\2\d{4})"
+_ZONE = r"(?:Z|[-+]\d{2}:?\d{2})?"
+_BEHIND_A_DAY = r"(?:[T_ ]+\d{1,2}[:-]\d{2}(?:[:-]\d{2}(?:[.,]\d+)?)?)?"
+_TIME = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?"
+DATES = re.compile(rf"(?<![\w.]){_DAY}{_BEHIND_A_DAY}{_ZONE}(?![\w.])|(?<![\w.:]){_TIME}(?![\w.:])")
+"""Dates and times of day, which are no numbers of a pose."""
+_CELLS = re.compile(r"\s*[;\t]\s*|\s+")
+_WITH_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?|[-+]?\d+")
+_SAMPLE_BYTES = 2000
+_MOSTLY = 0.4
 POSE_SIZES = (6, 7, 12, 16, 8, 13, 17)
 """Numbers of a pose; the last three with a time stamp or a running number before them."""
 
@@ -46,24 +59,56 @@ def read_tree(path: Path) -> Any:
     """
     suffix = path.suffix.lower()
     try:
-        if suffix in (".npy", ".npz", ".mat"):
+        if suffix in _ARRAYS:
             content = read_file(path, _ARRAY_LIMIT_BYTES)  # larger: an image of depths
             return {name: array.tolist() for name, array in _arrays(path, content).items()}
-        if suffix not in _SUFFIXES:
+        if suffix not in DATA_SUFFIXES:
             return None
         content = read_file(path, _BYTES_LIMIT)
-        if suffix == ".json":
-            return json.loads(content)
-        if suffix in _YAML:
-            plain = re.sub(rb"^%YAML.*\n|!!opencv-matrix|!!python/\S+", b"", content)
-            return strict_yaml.load_plain(plain)
-        if suffix == ".xml":
+        if suffix == ".xml":  # says itself in which letters it is written
             return _of_xml(ElementTree.fromstring(content))
-        return _of_text(content.decode("utf-8-sig", "replace"))
+        text = _decoded(content)
+        if suffix == ".json":
+            return json.loads(text)
+        if suffix in _YAML:
+            plain = re.sub(r"^%YAML.*\n|!!opencv-matrix|!!python/\S+", "", text)
+            return strict_yaml.load_plain(plain.encode())
+        return _of_text(_with_points(text))
     except UnreadableArraysError:
         raise
     except (OSError, ValueError, EOFError, RecursionError, yaml.YAMLError, ElementTree.ParseError):
         return None
+
+
+def _decoded(content: bytes) -> str:
+    """The text of a file in UTF-8 or UTF-16, with its mark of the order of bytes or without."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", "replace")
+    for first, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):  # of Latin letters every other byte is 0
+        zeros = content[first:_SAMPLE_BYTES:2]
+        if zeros and zeros.count(0) > _MOSTLY * len(zeros):
+            return content.decode(encoding, "replace")
+    return content.decode("utf-8-sig", "replace")
+
+
+def _with_points(text: str) -> str:
+    """The text with decimal points, where all lines of numbers have decimal commas."""
+    if re.search(r"\d\.\d", _without_words(text)):
+        return text
+    separated = [_CELLS.split(line.strip().strip(";")) for line in text.splitlines()]
+    rows = [cells for cells in separated if len(cells) >= min(POSE_SIZES) and _WITH_COMMA.search(cells[-1])]
+    if not rows or not all(_is_cell(cell) for cells in rows for cell in cells):
+        return text
+    return re.sub(r"(?<![\w.,])([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)(?![\w,])", r"\1.\2", text)
+
+
+def _without_words(text: str) -> str:
+    return DATES.sub(" ", IMAGE.sub(" ", text))
+
+
+def _is_cell(cell: str) -> bool:
+    """Tell whether a cell is a number with at most a comma in it, or a word."""
+    return bool(_WITH_COMMA.fullmatch(cell) or "," not in cell)
 
 
 def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray[Any, Any]]:
@@ -122,6 +167,7 @@ def _of_text(text: str) -> Any:
     """
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(("#", "%"))]
     header = re.split(r"[,;\t]", lines[0]) if lines else []
+    header = [name.strip().strip("\"'") for name in header]
     if len(header) >= 6 and not _NUMBER.search(lines[0]):
         names = [re.sub(r"\W.*", "", name.strip().lower()) for name in header]
         cells = [re.split(r"[,;\t]", line) for line in lines[1:]]
@@ -129,7 +175,7 @@ def _of_text(text: str) -> Any:
     groups, heading = defaultdict[tuple[str, int], list[Any]](list), ""
     for line in lines:
         image = IMAGE.search(line)
-        rest = line.replace(image[0], "") if image else line
+        rest = DATES.sub(" ", line.replace(image[0], "") if image else line)
         inside = [_numbers(part) for part in re.findall(r"\[([^\[\]]+)\]", rest)]
         numbers = next((part for part in inside if len(part) in POSE_SIZES), _numbers(rest))
         said = _NUMBER.sub("", re.sub(r"\[[^\[\]]*+\]", "", rest))
@@ -156,7 +202,8 @@ def _of_text(text: str) -> Any:
 
 
 def _value(text: str) -> Any:
-    numbers = _numbers(text)
+    text = text.strip().strip("\"'")
+    numbers = _numbers(DATES.sub(" ", text))
     return numbers[0] if len(numbers) == 1 else numbers or text.strip()
 
 

@@ -358,7 +358,7 @@ def test_one_of_two_tables_is_named_the_robots_and_a_reading_told_whole_is_taken
         robot[:, :3, 3] += noise_m * rng.standard_normal((len(robot), 3))
         rotation_vectors(tmp_path, robot)
         (tmp_path / "tcp_pose.txt").rename(tmp_path / "a.txt")
-        with raises("no-pairs"):
+        with raises("which-poses"):
             believe(look(tmp_path))
         held = look(tmp_path, Path("a.txt"))
         found = believe(held, Given("ur-rotvec", "eye-in-hand"))

@@ -1,0 +1,577 @@
+"""Layouts of other people's folders: what goes together is read right, or asked about, and never mixed up."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibrate.geometry import pose, rotation_exp
+from calibrate.imported import Given, believe, board
+from recordings.cli import main
+from recordings.errors import AmbiguousSourceError
+from recordings.importers.tables import look
+from recordings.reader import open_recording
+from tests.calibrate.pose_files import euler, quaternions
+from tests.calibrate.sessions import PAPER_BOARD, X_TRUE, Scene, write_session
+from tests.codes import raises
+from tests.command_line import call
+
+VIEWS = 8
+
+
+class Beside(Scene):
+    """What another camera on the same arm sees at the same poses."""
+
+    def flange_poses(self) -> tuple[np.ndarray, np.ndarray]:
+        return SCENES["one"].flange_poses()
+
+
+SCENES = {
+    "one": Scene(views=VIEWS, seed=1),
+    "two": Scene(views=VIEWS, seed=2),
+    "beside": Beside(views=VIEWS, seed=1, X=X_TRUE @ pose(rotation_exp([0, 0.02, 0]), [0.02, 0.0, 0.0])),
+}
+"""Two sessions of a camera, and another camera in the first one."""
+GIVEN = Given(mount="eye-in-hand", board=PAPER_BOARD)
+OTHER_BOARD = msgspec.structs.replace(PAPER_BOARD, columns=12, rows=11)
+FAILING = Path(__file__).parents[3] / "shared/failing"
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Pictures by scene, encoded as they are asked for, and the robot's poses at each."""
+
+    pixels: dict[str, list[np.ndarray]]
+    flanges: dict[str, np.ndarray]
+    shown_by: dict[str, tuple[str, int]]
+    """Hash of a file → scene and view."""
+
+    def save(self, path: Path, scene: str, view: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), self.pixels[scene][view])
+        self.shown_by[_hash(path)] = scene, view
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory: pytest.TempPathFactory) -> Shots:
+    pixels: dict[str, list[np.ndarray]] = {}
+    flanges: dict[str, np.ndarray] = {}
+    for name, scene in SCENES.items():
+        recording = open_recording(write_session(tmp_path_factory.mktemp(name) / "s.mcap", scene))
+        pixels[name] = [image.pixels for _, image in recording.images()]
+        flanges[name] = np.array([view.base_from_flange for view in recording.views()])
+    return Shots(pixels, flanges, {})
+
+
+@pytest.fixture(autouse=True)
+def _seen_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The board is looked for once in the same pictures, whatever their files are called."""
+
+    def seen(held: Any, given: Any, paths: list[Path], progress: Any) -> board.Seen | None:
+        keys = [_hash(path) for path in paths]
+        key = given, len(held.cameras), *keys
+        if key not in _SEEN:
+            found = board.see_board(held, given, paths, progress)
+            _SEEN[key] = found, dict(zip(paths, keys, strict=True))
+        found, hashes = _SEEN[key]
+        if found is None:
+            return None
+        renamed = dict(zip(keys, paths, strict=True))
+        views = {renamed[hashes[path]]: view for path, view in found.views.items()}
+        candidates = {renamed[hashes[path]]: each for path, each in found.candidates.items()}
+        return replace(found, views=views, candidates=candidates)
+
+    monkeypatch.setattr("calibrate.imported.folder.see_board", seen)
+
+
+_SEEN: dict[object, tuple[board.Seen | None, dict[Path, str]]] = {}
+
+
+def require_right(
+    shots: Shots, folder: Path, given: Given = GIVEN, poses: Path | None = None, most: int = VIEWS
+) -> set[str]:
+    """Every image has the pose at which it was taken; returns the scenes that were taken."""
+    believed = believe(look(folder, poses), given)
+    assert len(believed.rows) == most
+    shown = [shots.shown_by[_hash(folder / row.image)] for row in believed.rows]
+    true = np.array([shots.flanges[scene][view] for scene, view in shown])
+    np.testing.assert_allclose([row.base_from_flange for row in believed.rows], true, atol=1e-4)
+    return {scene for scene, _ in shown}
+
+
+# ---- one set: names, nesting, formats, encodings
+
+NAMES = (
+    "img_{n:02d}.jpg",
+    "images/{n}.png",
+    "data/rgb/IMG-{n:04d}.bmp",
+    "frame {n}.png",
+    "cam_2/left_{n}_of_8.tiff",
+    "pose_{n:02d}/image.png",
+    "run/{n}/rgb.png",
+    "run 1/position{n}/camera/shot_1.jpg",
+    "calib/2024-05-0{n}_10-11-12/colour.png",
+)
+
+
+def save_images(shots: Shots, folder: Path, name: str, scene: str = "one") -> list[Path]:
+    paths = [folder / name.format(n=n + 1) for n in range(VIEWS)]
+    for view, path in enumerate(paths):
+        shots.save(path, scene, view)
+    return paths
+
+
+def lines(table: np.ndarray, between: str = ",") -> list[str]:
+    return [between.join(f"{number:.7f}" for number in row) for row in table]
+
+
+def text_rows(folder: Path, T: np.ndarray, paths: list[Path]) -> None:
+    (folder / "robot_poses.txt").write_text("\n".join(lines(quaternions(T), " ")))
+
+
+def one_json_beside(folder: Path, T: np.ndarray, paths: list[Path]) -> None:
+    for path, each in zip(paths, T, strict=True):
+        own_folder = path.with_name("data.json")
+        beside = path.with_name(f"{path.stem}_pose.json")
+        own = own_folder if len({p.parent for p in paths}) == len(paths) else beside
+        own.write_text(json.dumps({"O_T_EE": each.ravel("F").tolist()}))
+
+
+@pytest.mark.parametrize("write", [text_rows, one_json_beside])
+@pytest.mark.parametrize("name", NAMES)
+def test_names_and_nesting_do_not_matter(
+    name: str, write: Callable[[Path, np.ndarray, list[Path]], None], shots: Shots, tmp_path: Path
+) -> None:
+    paths = save_images(shots, tmp_path, name)
+    write(tmp_path, shots.flanges["one"], paths)
+    require_right(shots, tmp_path)
+
+
+ORDER = np.random.default_rng(7).permutation(VIEWS)
+"""Rows that are not in the images' order."""
+
+
+def csv_with_a_header(folder: Path, T: np.ndarray, names: list[str], head: str = "image") -> None:
+    rows = [f"{names[k]},{line}" for k, line in enumerate(lines(quaternions(T)))]
+    text = "\n".join([f"{head},x,y,z,qx,qy,qz,qw", *(rows[k] for k in ORDER)])
+    (folder / "robot_poses.csv").write_text(text)
+
+
+def csv_names_last(folder: Path, T: np.ndarray, names: list[str]) -> None:
+    rows = [f'{line},"{names[k]}"' for k, line in enumerate(lines(quaternions(T)))]
+    text = "\n".join(["x,y,z,qx,qy,qz,qw,filename", *(rows[k] for k in ORDER)])
+    (folder / "robot_poses.csv").write_text(text)
+
+
+def json_by_name(folder: Path, T: np.ndarray, names: list[str]) -> None:
+    told = {names[k]: {"tcp_pose": T[k].tolist()} for k in ORDER}
+    (folder / "robot.json").write_text(json.dumps(told))
+
+
+def json_by_name_directly(folder: Path, T: np.ndarray, names: list[str]) -> None:
+    (folder / "robot.json").write_text(json.dumps({names[k]: T[k].tolist() for k in ORDER}))
+
+
+def json_list(folder: Path, T: np.ndarray, names: list[str]) -> None:
+    rows = [{"file": names[k], "flange": quaternions(T)[k].tolist()} for k in ORDER]
+    (folder / "robot.json").write_text(json.dumps({"samples": rows}))
+
+
+def text_with_names(folder: Path, T: np.ndarray, names: list[str]) -> None:
+    rows = [f"{names[k]} {line}" for k, line in enumerate(lines(quaternions(T), " "))]
+    (folder / "robot.txt").write_text("\n".join(rows[k] for k in ORDER))
+
+
+@pytest.mark.parametrize("told", ["{name}", "images\\{name}", "/home/me/data/images/{name}", "{stem}"])
+@pytest.mark.parametrize(
+    "write",
+    [csv_with_a_header, csv_names_last, json_by_name, json_by_name_directly, json_list, text_with_names],
+)
+def test_rows_go_by_the_names_that_they_tell(
+    write: Callable[[Path, np.ndarray, list[str]], None], told: str, shots: Shots, tmp_path: Path
+) -> None:
+    if told == "{stem}" and write not in (csv_with_a_header, json_list):
+        pytest.skip("without an ending only a column or key that says so names an image")
+    paths = save_images(shots, tmp_path, "images/img_{n}.png")
+    write(tmp_path, shots.flanges["one"], [told.format(name=path.name, stem=path.stem) for path in paths])
+    require_right(shots, tmp_path)
+
+
+@pytest.mark.parametrize("head", ["id", "index", "frame"])
+def test_rows_go_by_the_numbers_of_a_column(head: str, shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "img_{n}.png")
+    csv_with_a_header(tmp_path, shots.flanges["one"], [str(n + 1) for n in range(VIEWS)], head)
+    require_right(shots, tmp_path)
+
+
+def _behind(stamp: str) -> Callable[[np.ndarray], str]:
+    return lambda T: "\n".join(
+        f"p({line})   {stamp.format(n=n)}" for n, line in enumerate(lines(_rotvec(T), ", "))
+    )
+
+
+def _before(stamp: str) -> Callable[[np.ndarray], str]:
+    return lambda T: "\n".join(f"{stamp.format(n=n)};{line}" for n, line in enumerate(lines(_rotvec(T), ";")))
+
+
+def _rotvec(T: np.ndarray) -> np.ndarray:
+    return np.column_stack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_rotvec()])
+
+
+def _with_commas(between: str, header: str = "") -> Callable[[np.ndarray], str]:
+    def text(T: np.ndarray) -> str:
+        rows = lines(euler("ZYX", 1e3, True)(T), between)
+        return "\n".join([*([header] if header else []), *(row.replace(".", ",") for row in rows)])
+
+    return text
+
+
+TEXTS = {
+    "date and time behind": _behind("2020-03-0{n} 10:10:59.119318"),
+    "iso date behind": _behind("2020-03-0{n}T10:10:59Z"),
+    "german date behind": _behind("{n}.3.2020 10:10"),
+    "time behind": _behind("10:1{n}:59"),
+    "seconds since 1970 behind": lambda T: "\n".join(
+        f"{line}, {1.6e9 + n:.3f}" for n, line in enumerate(lines(_rotvec(T), ", "))
+    ),
+    "date before": _before("2020/03/0{n} 10:10:59"),
+    "commas and semicolons": _with_commas(";"),
+    "commas and semicolons, header": _with_commas(";", "X;Y;Z;A;B;C"),
+    "commas and tabs": _with_commas("\t"),
+    "commas and spaces": _with_commas("  "),
+}
+
+
+@pytest.mark.parametrize("what", TEXTS)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_dates_commas_and_encodings(what: str, encoding: str, shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    (tmp_path / "robot.txt").write_text(TEXTS[what](shots.flanges["one"]), encoding=encoding)
+    require_right(shots, tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("suffix", ["json", "yaml"])
+def test_other_encodings_of_trees(suffix: str, encoding: str, shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    text = json.dumps([{"tcp": each.tolist()} for each in shots.flanges["one"]])
+    (tmp_path / f"robot.{suffix}").write_text(text, encoding=encoding)
+    require_right(shots, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "plain", ["0.1, 0.2, 0.3, 1, 2, 3", "1,2,3,4,5,6", "0, 0, 100, 1, 2, 3", "1;2;3;4;5;6"]
+)
+def test_points_stay_where_commas_separate(plain: str, tmp_path: Path) -> None:
+    rows = [plain.replace("3", str(n)) for n in range(3, 9)]
+    (tmp_path / "robot.txt").write_text("\n".join(rows))
+    (table,) = look(tmp_path).tables
+    expected = [[float(cell) for cell in row.replace(";", ",").split(",")] for row in rows]
+    np.testing.assert_allclose(table.numbers, expected)
+
+
+# ---- several sets: asked, and the answer is taken
+
+
+def two_sessions(name: str, table: str) -> Callable[[Shots, Path], Iterator[tuple[str, str, str]]]:
+    def write(shots: Shots, folder: Path) -> Iterator[tuple[str, str, str]]:
+        for session, scene in (("1", "one"), ("2", "two")):
+            images = save_images(shots, folder, name.replace("SESSION", session), scene)
+            path = folder / table.replace("SESSION", session)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(path, quaternions(shots.flanges[scene]))
+            yield scene, str(images[0].parent), str(path)
+
+    return write
+
+
+SESSIONS = {
+    "folders": two_sessions("sSESSION/img_{n}.png", "sSESSION/robot.txt"),
+    "folders below": two_sessions("data/run_SESSION/images/img_{n}.png", "data/run_SESSION/robot.txt"),
+    "dates": two_sessions("2024-05-0SESSION/img_{n}.png", "2024-05-0SESSION/calib_records.txt"),
+    "names of folders": two_sessions("images_SESSION/img_{n}.png", "robot_SESSION.txt"),
+    "poses elsewhere": two_sessions("images/session SESSION/{n}.png", "poses/session SESSION/robot.txt"),
+}
+
+
+@pytest.mark.parametrize("what", SESSIONS)
+def test_sessions_are_never_mixed(what: str, shots: Shots, tmp_path: Path) -> None:
+    sessions = list(SESSIONS[what](shots, tmp_path))
+    with raises("several-sets", AmbiguousSourceError, option="--images") as asked:
+        believe(look(tmp_path), GIVEN)
+    choices = asked.value.values["choices"]
+    assert isinstance(choices, list)
+    assert {frozenset(require_right(shots, tmp_path, replace(GIVEN, images=each))) for each in choices} == {
+        frozenset({"one"}),
+        frozenset({"two"}),
+    }
+    for scene, images, poses in sessions:
+        assert require_right(shots, tmp_path, replace(GIVEN, images=images)) == {scene}
+        assert require_right(shots, tmp_path, GIVEN, Path(poses)) == {scene}
+        assert require_right(shots, tmp_path, GIVEN, Path(poses).relative_to(tmp_path)) == {scene}
+
+
+def test_a_session_without_poses_takes_none_of_another(shots: Shots, tmp_path: Path) -> None:
+    for scene, session in (("one", "s1"), ("two", "s2")):
+        save_images(shots, tmp_path, f"{session}/img_{{n}}.png", scene)
+    np.savetxt(tmp_path / "s2/robot.txt", quaternions(shots.flanges["two"]))
+    assert require_right(shots, tmp_path) == {"two"}
+    with raises("no-pairs"):
+        believe(look(tmp_path), replace(GIVEN, images="s1"))
+
+
+def one_pose_file_each(shots: Shots, folder: Path, session: str, scene: str) -> None:
+    for n, path in enumerate(save_images(shots, folder, f"{session}/img_{{n:02d}}.png", scene)):
+        told = quaternions(shots.flanges[scene])[n]
+        path.with_name(f"pose_{n + 1:02d}.txt").write_text(" ".join(map(str, told)))
+
+
+def test_sessions_of_one_pose_a_file(shots: Shots, tmp_path: Path) -> None:
+    for session, scene in (("s1", "one"), ("s2", "two")):
+        one_pose_file_each(shots, tmp_path, session, scene)
+    with raises("several-sets"):
+        believe(look(tmp_path), GIVEN)
+    assert require_right(shots, tmp_path / "s1") == {"one"}
+    assert require_right(shots, tmp_path, GIVEN, Path("s2")) == {"two"}
+
+
+def test_one_table_that_names_the_images_of_two_sessions(shots: Shots, tmp_path: Path) -> None:
+    rows = []
+    for session, scene in (("s1", "one"), ("s2", "two")):
+        paths = save_images(shots, tmp_path, f"{session}/img_{{n}}.png", scene)
+        flanges = quaternions(shots.flanges[scene])
+        rows += [
+            f"{session}/{path.name} {line}" for path, line in zip(paths, lines(flanges, " "), strict=True)
+        ]
+    (tmp_path / "robot.txt").write_text("\n".join(rows))
+    with raises("several-sets"):
+        believe(look(tmp_path), GIVEN)
+    assert require_right(shots, tmp_path, replace(GIVEN, images="s1")) == {"one"}
+    assert require_right(shots, tmp_path, replace(GIVEN, images="s2/img_#.png")) == {"two"}
+
+
+CAMERAS = (
+    ("ir_{n:02d}.jpg", "rgb_{n:02d}.jpg"),
+    ("left_{n}.png", "right_{n}.png"),
+    ("left/img_{n}.png", "right/img_{n}.png"),
+    ("cam0/{n}.png", "cam1/{n}.png"),
+    ("pose_{n}/left.png", "pose_{n}/right.png"),
+    ("{n}_a.png", "{n}_b.png"),
+)
+
+
+@pytest.mark.parametrize(("first", "second"), CAMERAS)
+def test_two_cameras_are_asked_about(first: str, second: str, shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, first, "one")
+    save_images(shots, tmp_path, second, "beside")
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    with raises("several-sets", AmbiguousSourceError) as asked:
+        believe(look(tmp_path), GIVEN)
+    choices = asked.value.values["choices"]
+    assert isinstance(choices, list)
+    taken = [require_right(shots, tmp_path, replace(GIVEN, images=each)) for each in choices]
+    assert sorted(map(sorted, taken)) == [["beside"], ["one"]]
+
+
+def test_copies_of_the_same_pictures_are_no_second_set(shots: Shots, tmp_path: Path) -> None:
+    for folder in ("images", "backup"):
+        save_images(shots, tmp_path, f"{folder}/{{n}}.png")
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    assert require_right(shots, tmp_path) == {"one"}
+
+
+# ---- what the user says
+
+
+def two_tables(shots: Shots, folder: Path) -> None:
+    save_images(shots, folder, "images/{n}.png")
+    np.savetxt(folder / "test.txt", quaternions(shots.flanges["one"]))
+    np.savetxt(folder / "40_poses_test.txt", quaternions(shots.flanges["two"]))
+
+
+def test_an_existing_file_is_meant_before_a_name_that_ends_so(shots: Shots, tmp_path: Path) -> None:
+    two_tables(shots, tmp_path)
+    assert [table.name for table in look(tmp_path, Path("test.txt")).told or []] == ["test.txt"]
+    assert require_right(shots, tmp_path, GIVEN, Path("test.txt")) == {"one"}
+    (tmp_path / "below").mkdir()
+    (tmp_path / "test.txt").rename(tmp_path / "below/test.txt")
+    assert require_right(shots, tmp_path, GIVEN, Path("test.txt")) == {"one"}, "a whole name goes first"
+
+
+def test_what_is_told_and_not_there_is_an_error(shots: Shots, tmp_path: Path) -> None:
+    two_tables(shots, tmp_path)
+    with raises("told-not-there", option="--poses", told="others.txt"):
+        believe(look(tmp_path, Path("others.txt")), GIVEN)
+    with raises("told-not-there", option="--images", told="others"):
+        believe(look(tmp_path), replace(GIVEN, images="others"))
+    (tmp_path / "empty.txt").write_text("nothing here")
+    with raises("told-not-there", option="--poses"):
+        believe(look(tmp_path, Path("empty.txt")), GIVEN)
+    with raises("told-board-unseen"):
+        believe(look(tmp_path, Path("test.txt")), replace(GIVEN, board=OTHER_BOARD))
+    np.savetxt(tmp_path / "short.txt", quaternions(shots.flanges["one"])[:6])
+    with raises("told-poses-unpaired"):
+        believe(look(tmp_path, Path("short.txt")), GIVEN)
+
+
+def test_a_board_is_not_told_for_nothing(shots: Shots, tmp_path: Path) -> None:
+    """Beside pictures the pictures are meant; without them nothing would use it."""
+    seen = np.array(SCENES["one"].camera_from_board())
+    for n, path in enumerate(save_images(shots, tmp_path, "pose_{n}/image.png")):
+        told = {"O_T_EE": shots.flanges["one"][n].tolist(), "T_cam_target": seen[n].tolist()}
+        path.with_name("data.json").write_text(json.dumps(told))
+    assert require_right(shots, tmp_path) == {"one"}
+    with raises("told-board-unseen"):
+        believe(look(tmp_path), replace(GIVEN, board=OTHER_BOARD))
+    for path in tmp_path.glob("*/image.png"):
+        path.unlink()
+    assert len(believe(look(tmp_path), Given(mount="eye-in-hand")).rows) == VIEWS
+    with raises("told-not-used", option="--board"):
+        believe(look(tmp_path), GIVEN)
+
+
+def test_the_question_is_for_programs_too(shots: Shots, tmp_path: Path) -> None:
+    for name, scene in (("a/{n}.png", "one"), ("b/{n}.png", "beside")):
+        save_images(shots, tmp_path, name, scene)
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    told = ("import", tmp_path, "--dry-run", "--json", "--board", "7x6 25", "--mount", "eye-in-hand")
+    asked = call(main, *told)
+    assert asked.returncode == 2
+    error = json.loads(asked.stdout)["error"]
+    assert error["code"] == "several-sets"
+    assert error["values"]["choices"] == ["a/#.png", "b/#.png"]
+    answered = call(main, *told, error["values"]["option"], error["values"]["choices"][1])
+    assert answered.returncode == 0, answered.stderr
+    assert any("a/#.png" in line for line in json.loads(answered.stdout)["not_used"])
+
+
+# ---- pairs without images
+
+
+def camodocals(folder: Path, robot: np.ndarray, seen: np.ndarray, name: str = "T{of}_{n}") -> None:
+    rows = {}
+    for n in range(len(robot)):
+        rows[name.format(of=1, n=n)] = robot[n].tolist()
+        rows[name.format(of=2, n=n)] = seen[n].tolist()
+    (folder / "TransformPairs.yaml").write_text(json.dumps(rows))
+
+
+@pytest.mark.parametrize("name", ["T{of}_{n}", "pose{of}-{n:02d}", "H{n}_{of}"])
+def test_a_number_that_tells_two_things_apart_is_not_folded(name: str, tmp_path: Path) -> None:
+    scene = Scene(views=12)
+    robot, seen = scene.flange_poses()[0], scene.camera_from_board()
+    camodocals(tmp_path, robot, seen, name)
+    with raises("which-poses", AmbiguousSourceError, option="--poses") as asked:
+        believe(look(tmp_path))
+    choices = asked.value.values["choices"]
+    assert isinstance(choices, list)
+    rows = believe(look(tmp_path, Path(choices[0])), Given("moveit", "eye-in-hand")).rows
+    np.testing.assert_allclose([row.base_from_flange for row in rows], robot, atol=1e-6)
+    np.testing.assert_allclose([row.camera_from_board for row in rows], seen, atol=1e-6)
+
+
+def test_a_grid_of_places_is_one_table(shots: Shots, tmp_path: Path) -> None:
+    for n in range(VIEWS):
+        shots.save(tmp_path / f"img_{n // 4}_{n % 4}.png", "one", n)
+        told = " ".join(map(str, quaternions(shots.flanges["one"])[n]))
+        (tmp_path / f"tcp_{n // 4}_{n % 4}.txt").write_text(told)
+    assert require_right(shots, tmp_path) == {"one"}
+
+
+# ---- files that are not used
+
+
+def test_two_sizes_are_said(shots: Shots, tmp_path: Path) -> None:
+    paths = save_images(shots, tmp_path, "images/{n}.png")
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    cv2.imwrite(str(paths[3]), cv2.resize(shots.pixels["one"][3], None, fx=2, fy=2))
+    with raises("image-sizes") as refused:
+        believe(look(tmp_path), GIVEN)
+    sizes = str(refused.value.values["sizes"])
+    assert "480×384" in sizes and "960×768" in sizes and paths[3].name in sizes
+
+
+OPENCV = """%YAML:1.0
+---
+translation: !!opencv-matrix
+   rows: 3
+   cols: 1
+   dt: d
+   data: [ 1., 2., 3. ]
+"""
+RESULTS: dict[str, Callable[[Path], object]] = {
+    "points.mod": lambda path: path.write_text("CONST robtarget p1:=[[1,2,3],[1,0,0,0]];"),
+    "points.src": lambda path: path.write_text("PTP {X 1}"),
+    "points.dat": lambda path: path.write_text("DEFDAT P\nDECL E6POS XP1={X 1,Y 2,Z 3,A 4,B 5,C 6}\nENDDAT"),
+    "MAIN.LS": lambda path: path.write_text("/PROG MAIN"),
+    "poses.pkl": lambda path: path.write_bytes(pickle.dumps([1])),
+    "calibration.yaml": lambda path: path.write_text("format: handeye-calibration/2\nboard: {columns: 3}\n"),
+    "easy.yaml": lambda path: path.write_text(
+        "parameters: {eye_on_hand: false}\ntransformation: {x: 1, y: 2, z: 3, qx: 0, qy: 0, qz: 0, qw: 1}\n"
+    ),
+    "a_result.yml": lambda path: path.write_text(OPENCV),
+    "notes.md": lambda path: path.write_text("eye to hand"),
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_what_is_seen_and_not_used_is_named(name: str, shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    RESULTS[name](tmp_path / name)
+    believed = believe(look(tmp_path), GIVEN)
+    assert len(believed.rows) == VIEWS
+    (line,) = believed.unused
+    assert name in line or Path(name).suffix in line
+    held = look(tmp_path)
+    assert not {"rows", "cols", "columns"} & held.facts.keys()
+
+
+def test_many_files_of_a_kind_are_one_line(shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    for n in range(20):
+        (tmp_path / f"step{n}.ls").write_text("/PROG")
+        (tmp_path / f"draw{n}.py").write_text("pass")
+    lines_told = believe(look(tmp_path), GIVEN).unused
+    assert len(lines_told) == 2
+    assert all("20" in line for line in lines_told)
+
+
+# ---- what others left
+
+RIGHT = ("csv-with-header-names-not-used", "date-behind-the-pose", "one-folder-a-pose")
+
+
+@pytest.mark.skipif(not FAILING.is_dir(), reason="the inputs that once went wrong are not here")
+@pytest.mark.parametrize("name", RIGHT)
+def test_inputs_that_once_went_wrong_are_read(name: str) -> None:
+    believed = believe(look(FAILING / name / "data"))
+    assert believed.dataset.mount == "eye-in-hand"
+    assert len(believed.rows) == 12
+    assert believed.dataset.board.square_m == pytest.approx(0.025, rel=0.01)
+
+
+@pytest.mark.skipif(not FAILING.is_dir(), reason="the inputs that once went wrong are not here")
+def test_inputs_that_once_went_wrong_are_asked_about() -> None:
+    for name, code in (
+        ("two-cameras-in-one-folder", "several-sets"),
+        ("two-sizes-said-no-board", "image-sizes"),
+    ):
+        with raises(code):
+            believe(look(FAILING / name / "data"))

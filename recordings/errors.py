@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -189,6 +189,66 @@ class AmbiguousSourceError(ImportSourceError):
 
     code = "several-sets"
     exit_code = 2
+
+
+@dataclass(frozen=True)
+class StandingReading:
+    """One of several ways to read data that nothing excludes."""
+
+    text: str
+    """What it says, for a person."""
+    options: dict[str, str]
+    """Options of `recordings import` that choose it, such as {"board_pose": "camera-from-board"}."""
+    translation_mm: tuple[float, float, float] | None = None
+    """Of its X: of flange_from_camera or base_from_camera, by the mounting; None where X does not differ."""
+
+    @property
+    def command(self) -> str:
+        """The options as a shell takes them."""
+        named = (f"--{name.replace('_', '-')} {shlex.quote(told)}" for name, told in self.options.items())
+        return " ".join(named)
+
+    @property
+    def line(self) -> str:
+        """All of it in a line."""
+        if self.translation_mm is None:
+            return f"{self.text} ({self.command})"
+        at = ", ".join(f"{each:.0f}" for each in self.translation_mm)
+        return f"{self.text}, camera at {at} mm ({self.command})"
+
+
+class SeveralReadingsError(ImportSourceError):
+    """More than one way to read the data stands: a person is asked, nothing is guessed.
+
+    Values: `count`, and of each reading N, from 1, `reading_N`, `options_N` and, where X differs,
+    `translation_N_mm`.
+    """
+
+    code = "several-readings"
+    exit_code = 2
+
+    readings: tuple[StandingReading, ...] = ()
+    """What stands; empty in an error that came over the wire."""
+
+
+def several_readings(source: Path, readings: Sequence[StandingReading], decides: str) -> SeveralReadingsError:
+    """An error that asks which of `readings` is meant; `decides`: a sentence on what would decide."""
+    told: dict[str, Value] = {}
+    for n, each in enumerate(readings, 1):
+        told[f"reading_{n}"] = each.text
+        told[f"options_{n}"] = each.command
+        if each.translation_mm is not None:
+            told[f"translation_{n}_mm"] = ", ".join(f"{part:.1f}" for part in each.translation_mm)
+    error = SeveralReadingsError(
+        "several-readings",
+        source=source,
+        count=len(readings),
+        listed="; ".join(f"({n}) {each.line}" for n, each in enumerate(readings, 1)),
+        decides=decides,
+        **told,
+    )
+    error.readings = tuple(readings)
+    return error
 
 
 def disk_error(doing: str, path: Path, error: OSError, advice: str = "") -> RecordingError:

@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,17 +19,22 @@ from calibrate.boards.model import typed_board
 from calibrate.imported import Given, believe, is_described
 from calibrate.job import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
-from recordings.errors import AmbiguousSourceError
+from recordings.errors import (
+    AmbiguousSourceError,
+    SeveralReadingsError,
+    StandingReading,
+    several_readings,
+)
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, import_bag
 from recordings.importers.bags import BAGS, UNFINISHED
+from recordings.importers.conventions import BoardPose, CameraAxes
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
 from recordings.importers.folder import Imported, import_folder, write_views
 from recordings.importers.messages import Progress
 from recordings.importers.reader import look
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import StandstillLimits
-from recordings.importers.tables import Contents
 from recordings.plain_text import plain_text
 from recordings.schema.messages import Mount
 from recordings.schema.stillness import POSITION_M, ROTATION_RAD
@@ -63,6 +68,19 @@ def import_command(
         ),
     ] = None,
     mount: Annotated[Mount | None, typer.Option(help="eye-in-hand or eye-to-hand.")] = None,
+    board_pose: Annotated[
+        BoardPose | None,
+        typer.Option(
+            help="Of pairs without images: camera-from-board (the board in the camera) or board-from-camera."
+        ),
+    ] = None,
+    camera_axes: Annotated[
+        CameraAxes | None,
+        typer.Option(
+            help="Of pairs: optical (z forward), opengl (-z forward, y up) or ros (x forward, z up). "
+            "X becomes that of the optical frame."
+        ),
+    ] = None,
     board: Annotated[
         str | None, typer.Option(help="Such as '9x6 25' (mm) or 'charuco 8x6 30 22 DICT_5X5_100'.")
     ] = None,
@@ -100,27 +118,28 @@ def import_command(
     target = None if dry_run else output
     console = plain_console(stderr=True)
     shown = console.is_terminal and not as_json
-    told = {"--poses": None if poses is None else str(poses), "--images": images}
+    showing = (lambda: progress_bar("", console)) if shown else (lambda: nullcontext(lambda *_: None))
+    reading = _Reading(convention, mount, board, poses, images, board_pose, camera_axes)
     done: Imported | None = None
     while done is None:
         try:
-            with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
-                if is_described(source, dataset, poses, images, convention, mount, board):
+            with showing() as progress:
+                if is_described(source, dataset, *vars(reading).values()):
                     done = import_folder(source, target, progress)
                 elif _is_folder_of_anyone(source):
-                    held = look(source, None if told["--poses"] is None else Path(told["--poses"]))
-                    description = read_dataset(dataset)[0] if dataset else _told(held.root, output)
-                    size_told = None if board is None else typed_board(board)
-                    given = Given(convention, mount, size_told, told["--images"])
-                    done = _import_found(held, target, description, given, progress)
+                    done = _import_found(source, target, dataset, output, reading, progress)
                 else:
                     wanted = Wanted(image_topic, pose_topic, base, flange, joint_topic)
                     limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
                     done = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
-        except AmbiguousSourceError as several:
-            if not (shown and sys.stdin.isatty()):
+        except SeveralReadingsError as problem:
+            if as_json or not sys.stdin.isatty():
                 raise
-            told[str(several.values["option"])] = _asked(several, console)
+            reading = reading.with_options(_asked(problem, console).options)
+        except AmbiguousSourceError as several:
+            if as_json or not sys.stdin.isatty():
+                raise
+            reading = reading.with_options(_asked(_as_readings(several), console).options)
     size_bytes = target.stat().st_size if target else 0
     facts = ImportJson(str(target or ""), done.images, size_bytes, done.facts, done.unused)
     if as_json:
@@ -138,20 +157,53 @@ def _is_folder_of_anyone(source: Path) -> bool:
     return not (source.name.endswith(UNFINISHED) or has_bag)
 
 
-def _asked(several: AmbiguousSourceError, console: Console) -> str:
-    """What the person at the terminal chooses."""
+@dataclass(frozen=True)
+class _Reading:
+    """Options that say how a folder is to be read."""
+
+    convention: str | None
+    mount: Mount | None
+    board: str | None
+    poses: Path | None
+    images: str | None
+    board_pose: BoardPose | None
+    camera_axes: CameraAxes | None
+
+    def with_options(self, options: dict[str, str]) -> _Reading:
+        """The same with the options of an answer, as the shell would give them."""
+        return msgspec.convert({**vars(self), **options}, _Reading, dec_hook=lambda kind, told: kind(told))
+
+    def given(self) -> Given:
+        board = None if self.board is None else typed_board(self.board)
+        return Given(self.convention, self.mount, board, self.images, self.board_pose, self.camera_axes)
+
+
+def _asked(problem: SeveralReadingsError, console: Console) -> StandingReading:
+    """Ask a person at a terminal which reading is meant. No answer is no reading: the error stands."""
+    console.print(
+        f"{problem.values['source']}: {len(problem.readings)} ways to read it stand:", soft_wrap=True
+    )
+    for n, each in enumerate(problem.readings, 1):
+        console.print(f"  {n}  {each.line}", soft_wrap=True)
+    console.print(f"{problem.values['decides']}", soft_wrap=True)
+    numbers = {str(n): each for n, each in enumerate(problem.readings, 1)}
+    while True:
+        console.print(f"Which one is meant (1 to {len(numbers)})? ", end="")
+        answer = sys.stdin.readline()
+        if not answer.strip():
+            raise problem
+        if answer.strip() in numbers:
+            return numbers[answer.strip()]
+
+
+def _as_readings(several: AmbiguousSourceError) -> SeveralReadingsError:
+    """The same question in the words of the other."""
     sets, choices = several.values["sets"], several.values["choices"]
     assert isinstance(sets, list)
     assert isinstance(choices, list)
-    console.print(plain_text(f"{several.text}"))
-    for number, each in enumerate(sets, 1):
-        console.print(plain_text(f"{number:>3}  {each}"))
-    number = 0
-    while not 1 <= number <= len(choices):
-        number = typer.prompt(f"Which one (1 to {len(choices)})", type=int, err=True)
-    chosen = choices[number - 1]
-    console.print(plain_text(f"as {several.values['option']} {shlex.quote(chosen)}"))
-    return chosen
+    option = str(several.values["option"]).removeprefix("--")
+    readings = [StandingReading(each, {option: choice}) for each, choice in zip(sets, choices, strict=True)]
+    return several_readings(Path(str(several.values["source"])), readings, "")
 
 
 def _told(source: Path, output: Path | None) -> Dataset | None:
@@ -166,10 +218,17 @@ def _told(source: Path, output: Path | None) -> Dataset | None:
 
 @single_threaded_opencv()
 def _import_found(
-    held: Contents, target: Path | None, told: Dataset | None, given: Given, progress: Progress
+    source: Path,
+    target: Path | None,
+    description: Path | None,
+    output: Path | None,
+    reading: _Reading,
+    progress: Progress,
 ) -> Imported:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
-    believed = believe(held, given, told, progress)
+    held = look(source, reading.poses)
+    told = read_dataset(description)[0] if description else _told(held.root, output)
+    believed = believe(held, reading.given(), told, progress)
     dataset = believed.dataset
     content = msgspec.yaml.encode(dataset)
     done = write_views(held.root, target, dataset, believed.rows, {DATASET_FILE: content}, progress)

@@ -33,6 +33,7 @@ from calibrate.handeye.axxb.certificate import TOLERANCE, certify
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective, pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
+from calibrate.handeye.board_motion import board_extent_m, boards_own_motion
 from calibrate.handeye.cell_fit import STAGES, CellFit, fit_cell
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corner_fit import fit_corners
@@ -97,6 +98,9 @@ def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution
     """
     options = options or SolveOptions()
     require_solvable(views)
+    near = boards_own_motion(views.base_from_flange, views.camera_from_board, board_extent_m(views))
+    if near is not None:
+        raise BadViewsError("boards-own-poses", away_m=near.away_m, away_rad=near.away_rad)
     if options.profile == "paper":
         return solve_paper_profile(views, options)
     return solve_robust_profile(views, options)

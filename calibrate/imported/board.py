@@ -21,7 +21,6 @@ from calibrate.boards.grids import count_circles, seen_size
 from calibrate.boards.markers import marker_detector
 from calibrate.boards.model import board_points, usual_markers
 from calibrate.errors import CalibrationError
-from calibrate.geometry import inverse
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.views import NO_CORNERS, BoardView, ViewSet
@@ -69,12 +68,10 @@ class Seen:
     """How the poses that were told are read; None: images show the board."""
     told: str = ""
     """Evidence for it."""
-    in_front: tuple[bool, bool] = (True, True)
-    """Whether the poses, and their inverses, place the board before the camera."""
 
 
 def told_boards(table: Table) -> Iterator[Seen]:
-    """Every reading of a table of board poses; of an inverted one the solution is the other mounting's."""
+    """Every reading of a table of board poses as it stands: `pair_readings` tells which way round it is."""
     rows = _spread(len(table.numbers), _MOST_ROWS)
     for how, evidence in possible(table.numbers):
         poses = how.poses(table.numbers[rows])
@@ -85,11 +82,10 @@ def told_boards(table: Table) -> Iterator[Seen]:
         candidates: dict[Key, list[Candidate]] = {
             row: [Candidate(T, 0)] for row, T in zip(rows, poses, strict=True)
         }
-        in_front, behind = (bool(np.mean(each[:, 2, 3] > 0) > 0.9) for each in (poses, inverse(poses)))
         seen = Seen(
             BoardSpec(BoardKind.UNSEEN), True, views, candidates, CameraModel(0, 0), False, len(views)
         )
-        yield replace(seen, convention=how, told=evidence, in_front=(in_front, behind))
+        yield replace(seen, convention=how, told=evidence)
 
 
 def _spread(count: int, most: int) -> list[int]:

@@ -7,14 +7,16 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
 
 from calibrate.boards.model import describe_board
-from calibrate.geometry import inverse
+from calibrate.geometry import inverse, pose
 from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boards
 from calibrate.imported.mounting import joints_of, joints_rad, mounting
+from calibrate.imported.pair_readings import PairsRead, ask_unit, read_pairs, rescaled, scales
 from calibrate.imported.sets import (
     ImageSet,
     PairSet,
@@ -25,10 +27,23 @@ from calibrate.imported.sets import (
     pairs_of,
     same_pictures,
 )
-from calibrate.imported.table_readings import TableReading, decide, is_good, table_readings
+from calibrate.imported.table_readings import (
+    TableReading,
+    decide,
+    is_good,
+    table_readings,
+    without_boards_own,
+)
 from recordings.errors import AmbiguousSourceError, ImportSourceError
 from recordings.image_headers import ImageError, read_header
-from recordings.importers.conventions import Convention, convention, tells_direction
+from recordings.importers.conventions import (
+    OPTICAL_FROM_AXES,
+    BoardPose,
+    CameraAxes,
+    Convention,
+    convention,
+    tells_direction,
+)
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
 from recordings.importers.image_files import header_bytes
 from recordings.importers.messages import Progress
@@ -45,6 +60,10 @@ _LISTED = 8
 """Most names of files and tables in an error."""
 
 
+_NAMED = 8
+"""Most outliers that are named."""
+
+
 @dataclass(frozen=True)
 class Given:
     """What the user says; None: find it."""
@@ -54,6 +73,10 @@ class Given:
     board: BoardSpec | None = None
     images: str | None = None
     """A folder or file, the end of the images' name with digits as #, or the table of the board's poses."""
+    board_pose: BoardPose | None = None
+    """Of pairs: the board in the camera, or the camera in the board."""
+    camera_axes: CameraAxes | None = None
+    """Of pairs: those of the camera in whose frame the board is told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +157,7 @@ def believe(
             raise ImportSourceError("no-board-found", source=held.root, board="board", images=families)
         said = describe_board(given.board)
         raise ImportSourceError("told-board-unseen", source=held.root, board=said, images=families)
+    tried = without_boards_own(held, tried)
     return _believed(held, given, decide(held, tried, given.convention, given.mount))
 
 
@@ -247,14 +271,28 @@ def _as_before(held: Contents, told: Dataset, poses: PosesTold) -> Believed:
     joints = tables.get(poses.joints)
     if poses.joints and (joints is None or len(joints.numbers) != len(table.numbers)):
         raise ImportSourceError("joints-rows", source=held.root, joints=poses.joints, poses=poses.table)
-    return Believed(told, _rows(held, table, convention(poses.convention), pairs, seen, joints))
+    how = convention(poses.convention)
+    return Believed(told, _rows(held, table, how, pairs, seen, joints, poses.camera_axes))
 
 
 def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
-    seen, pairs = best.seen, best.pairs
     joints, by_joints = joints_of(held, best) or (None, None)
     as_told = tells_direction(given.convention)
-    mount, inverted, board_inverted, why = mounting(held, given.mount, best, as_told, by_joints)
+    read: PairsRead | None = None
+    if best.seen.convention is not None:
+        robot_inverted = False if as_told else None
+        read = read_pairs(
+            held, best, given.mount, given.board_pose, given.camera_axes, robot_inverted, by_joints
+        )
+        best, mount, inverted, why = read.reading, read.mount, read.robot_inverted, read.why
+    else:
+        if given.board_pose or given.camera_axes:
+            raise ImportSourceError("pairs-option", source=held.root)
+        mount, inverted, why = mounting(held, given.mount, best, as_told, by_joints)
+        if len(factors := scales(held, best)) > 1:
+            raise ask_unit(held, best, factors, mount)
+        best = rescaled(best, factors[0])
+    seen, pairs = best.seen, best.pairs
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)
     facts = {
@@ -272,18 +310,35 @@ def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
     if joints:
         facts["joints"] = f"{len(joints.numbers)} rows of {joints.name}", "they move as the poses do"
     saw = None
-    if seen.convention is not None:
-        how_board = replace(seen.convention, inverse=seen.convention.inverse != board_inverted)
+    if seen.convention is not None and read is not None:
+        how_board = replace(seen.convention, inverse=seen.convention.inverse != read.board_inverted)
         saw = next(t for t in held.tables if t.name == best.family), how_board
         del facts["images"], facts["camera"]
-        facts["board"] = f"{len(pairs)} rows of {best.family}", f"{how_board.name}; {seen.told}"
-    seen_how, moved_by = saw[1].name if saw else "", joints.name if joints else ""
-    told = PosesTold(best.table.name, best.family, how.name, seen_how, moved_by, str(held.root.resolve()))
+        direction = "board-from-camera" if read.board_inverted else "camera-from-board"
+        facts["board"] = f"{len(pairs)} rows of {best.family}", f"{direction}, {how_board.name}; {seen.told}"
+        if given.camera_axes:
+            facts["camera axes"] = given.camera_axes, "as told; X is of the optical frame"
+        elif not read.ahead:
+            facts["camera axes"] = "not optical", "z < 0: X is of that table's frame; see --camera-axes"
+    if not best.agree.all():
+        odd = [view.name for view, agrees in zip(best.views, best.agree, strict=True) if not agrees]
+        named = ", ".join(odd[:_NAMED]) + (" …" if len(odd) > _NAMED else "")
+        facts["outliers"] = f"{len(odd)} of {len(best.agree)} do not agree with the others", named
+    axes: CameraAxes | Literal[""] = given.camera_axes or ""
+    told = PosesTold(
+        best.table.name,
+        best.family,
+        how.name,
+        saw[1].name if saw else "",
+        joints.name if joints else "",
+        str(held.root.resolve()),
+        axes,
+    )
     dataset = Dataset(mount, board, camera, held.root.resolve().name, poses=told)
     used = {best.table.files, saw[0].files if saw else best.family, *([joints.files] if joints else [])}
     describes = seen.camera_known or (seen.square_known and not saw)
     unused = _unused(held, used | (held.described_by if describes else set()))
-    return Believed(dataset, _rows(held, best.table, how, pairs, saw, joints), facts, unused)
+    return Believed(dataset, _rows(held, best.table, how, pairs, saw, joints, axes), facts, unused)
 
 
 def _unused(held: Contents, used: set[str]) -> list[str]:
@@ -362,11 +417,15 @@ def _rows(
     pairs: dict[Key, int],
     saw: tuple[Table, Convention] | None,
     joints: Table | None,
+    axes: CameraAxes | Literal[""],
 ) -> list[PoseRow]:
-    """Rows in the order of the robot's table; `saw`: where the board was, instead of images."""
+    """Rows in the order of the robot's table; `saw`: where the board was, instead of images, in a camera with
+    these axes, optical or as they are if not told."""
     keys = sorted(pairs, key=lambda key: pairs[key])
     flanges = how.poses(table.numbers[[pairs[key] for key in keys]])
     boards = None if saw is None else saw[1].poses(saw[0].numbers[np.array(keys)])
+    if boards is not None and axes:
+        boards = pose(OPTICAL_FROM_AXES[axes], np.zeros(3)) @ boards
     return [
         PoseRow(
             n + 1,

@@ -16,6 +16,7 @@ import numpy as np
 
 from calibrate.chain import learn_chain
 from calibrate.geometry import Array, inverse
+from calibrate.imported.directions import TOOL_POSE
 from calibrate.imported.scenery import mount_by_scene
 from calibrate.imported.table_readings import TableReading
 from recordings.errors import ImportSourceError
@@ -38,38 +39,30 @@ _TO_HAND = re.compile(
     re.I,
 )
 _TOOL_IN_BASE = re.compile(
-    r"(end|gripper|ee|tool|tcp|flange|hand)_?(2|to|in)_?base|base_(tcp|ee|tool|flange)|world_end|O_T_EE|t_base_tcp"
-    r"|robot_?(pose|coord|pos)|(tcp|tool|eef|ee|end|gripper|arm|effector)_?(pose|xyz|data|coord)|tool_?pose|\bhand\b"
-    r"|robot_?data|pose_(flange|tcp|tool|ee|gripper)|\bmove[jl]\b|(effector|hand)_(wrt|in)?_?world",
-    re.I,
+    rf"(end|gripper|ee|tool|tcp|flange|hand)_?(2|to|in)_?base|{TOOL_POSE.pattern}", re.I
 )
 _BASE_IN_TOOL = re.compile(r"base_?(2|to|in)_?(end|gripper|ee|tool|tcp|flange|hand)", re.I)
-_CAMERA_IN_BOARD = re.compile(r"cam\w*?_?(2|to|in|wrt)_?(board|target|marker|obj|chess|pattern|tag)", re.I)
 
 
 def mounting(
     held: Contents, given: Mount | None, best: TableReading, as_told: bool, by_joints: bool | None
-) -> tuple[Mount, bool, bool, str]:
-    """(mounting, whether the robot's poses are inverted, whether the board's are, why).
+) -> tuple[Mount, bool, str]:
+    """(mounting, whether the robot's poses are inverted, why) of images: of pairs see `pair_readings`.
 
     `as_told`: by the user's convention the direction is told, too. `by_joints`: whether joints say that the
     robot's poses are inverted. Raises ImportSourceError (`which-mount`) where nothing decides, or one
     contradicts another.
     """
-    name, seen = best.table.name, best.seen
-    named_so = seen.convention is not None and bool(_CAMERA_IN_BOARD.search(best.family))
-    turned_board = named_so if all(seen.in_front) else seen.in_front[1]
-    fits = _OTHER[best.mount] if turned_board else best.mount
-    by_turn: dict[bool | None, set[Mount]] = {None: set(), False: {fits}, True: {_OTHER[fits]}}
+    name, seen, fits = best.table.name, best.seen, best.mount
+    by_turn: dict[bool | None, set[Mount]] = {None: set(), False: {fits}, True: {OTHER_MOUNT[fits]}}
     told = ({given} if given else set()) | by_turn[False if as_told else None]
     evidence = {"joints": by_turn[by_joints]}
     possible = told | by_turn[by_joints]
     if not as_told and by_joints is None:
-        by_distances, far_apart = _inverted_by_distances(best)
+        by_distances, far_apart = inverted_by_distances(best)
         straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
         turned = inverted if straight != inverted else None
-        facts = " ".join(f"{key} {str(value).lower()}" for key, value in held.facts.items())
-        named = _named(f"{name} {best.family}") or _named(f"{held.words} {facts}")
+        named = mount_named(held, best)
         images = [(seen.images[view.index], view) for view in best.views] if seen.images else []
         names, scene = by_turn[turned] | named, mount_by_scene(images, seen.camera)
         evidence = {"names": names, "the scene around the board": scene, far_apart: by_turn[by_distances]}
@@ -84,10 +77,10 @@ def mounting(
         )
     (mount,) = possible
     by = "as told" if given else f"by {', '.join(what for what, _ in why)}; {name}"
-    return mount, mount != fits, turned_board, by
+    return mount, mount != fits, by
 
 
-def _inverted_by_distances(best: TableReading) -> tuple[bool | None, str]:
+def inverted_by_distances(best: TableReading) -> tuple[bool | None, str]:
     """(whether the poses, inverted, place what the arm carries nearer to it than what stands; None: hard to
     tell, distances in words). An inverted pose exchanges flange and base."""
     X, Y = (float(np.linalg.norm(T[0, :3, 3])) for T in (best.fit.X, best.fit.Y))
@@ -121,6 +114,12 @@ def joints_rad(table: Table) -> Array:
     return np.radians(table.numbers) if np.abs(table.numbers).max() > 2 * np.pi else table.numbers
 
 
+def mount_named(held: Contents, best: TableReading) -> set[Mount]:
+    """The mounting that the tables' names tell, or else those of folder, files and keys; empty: none."""
+    facts = " ".join(f"{key} {str(value).lower()}" for key, value in held.facts.items())
+    return _named(f"{best.table.name} {best.family}") or _named(f"{held.words} {facts}")
+
+
 def _named(words: str) -> set[Mount]:
     """The mounting that words name; words of both say nothing."""
     ways: dict[Mount, re.Pattern[str]] = {"eye-in-hand": _IN_HAND, "eye-to-hand": _TO_HAND}
@@ -128,4 +127,4 @@ def _named(words: str) -> set[Mount]:
     return found if len(found) == 1 else set()
 
 
-_OTHER: dict[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
+OTHER_MOUNT: dict[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}

@@ -5,21 +5,32 @@ They come before there is a recording. What `handeye.readings` tries are mistake
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.geometry import Array, inverse, rotation_angle, rotation_log
 from calibrate.handeye.axxb.pairs import mount_poses
-from calibrate.handeye.pose_fit import FREE, PoseFit, PoseViews, fit_poses, pose_views
+from calibrate.handeye.board_motion import BoardMotion, board_extent_m, boards_own_motion
+from calibrate.handeye.pose_fit import (
+    FREE,
+    PoseFit,
+    PoseViews,
+    agreed_start,
+    fit_poses,
+    pose_distances,
+    pose_views,
+)
 from calibrate.handeye.readings import clear_gain, explain_recording, explain_text
 from calibrate.handeye.solution import Reading
 from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates, with_poses
 from calibrate.views import ViewSet
-from recordings.errors import ImportSourceError
+from recordings.errors import ImportSourceError, StandingReading, several_readings
 from recordings.importers.conventions import Convention, convention, possible, tells_direction
 from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import Mount
@@ -34,6 +45,14 @@ _MOVES = 0.01
 """No arm's poses differ less, metres, radians or more: such a table is of what stands."""
 _STAYS_M, _STAYS_RAD = 0.015, 0.05
 """Median distance of the board from its place above which no reading is believed."""
+_SIZES = 0.01, 10.0
+"""Factors of squares guessed that are still a board's."""
+_FARTHEST_M = 20.0
+_STARTS, _FEW, _STEPS = 20, 6, 4
+"""Subsets of views from which those that agree are looked for, views in each, and steps from each."""
+_FEWEST_SURE, _SURE, _LEAD = 8, 1 / 3, 4.0
+"""Number and share of the views that must agree, and times the usual lead in evidence over any other reading,
+where less than half of them agree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +69,40 @@ class TableReading:
     mount: Mount
     views: ViewSet
     fit: PoseFit
-    stays_m: float
-    stays_rad: float
+    away_m: Array
+    """(n,) of the board from its place, by view."""
+    away_rad: Array
+    """(n,)"""
     told: str
     """Evidence by the numbers alone."""
+    inliers: NDArray[np.bool_] | None = None
+    """(n,) views that agree, where many do not; None: by the fit."""
 
     @property
     def text(self) -> str:
         return f"{self.table.name}: {self.mount}, {self.convention.name}"
+
+    @property
+    def stays_m(self) -> float:
+        return float(np.median(self.away_m))
+
+    @property
+    def stays_rad(self) -> float:
+        return float(np.median(self.away_rad))
+
+    @property
+    def agree(self) -> NDArray[np.bool_]:
+        """(n,) views that are ordinary ones by this reading."""
+        return np.asarray(self.fit.full > 0.5) if self.inliers is None else self.inliers
+
+    @property
+    def log_evidence(self) -> float:
+        """Of the robot's numbers as they are written: a smaller unit makes no smaller errors."""
+        return self.fit.log_evidence + 3 * len(self.agree) * math.log(self.convention.unit_m)
+
+
+_Likely = tuple[float, Convention, str, Array, Seen, list[Key], Mount]
+"""How far the board moves, the convention, its evidence, base_from_flange, the board, keys and mounting."""
 
 
 def table_readings(
@@ -66,7 +111,7 @@ def table_readings(
     """Yield the best readings that the views can judge; `named`: the convention that the user gives, beside
     which the others are tried all the same."""
     asked = None if named is None else convention(named)
-    likely: list[tuple[float, Convention, str, Array, Seen, list[Key], Mount]] = []
+    likely: list[_Likely] = []
     for seen in seens:
         keys = [key for key in seen.views if key in pairs]
         if len(keys) < FEWEST:
@@ -83,11 +128,45 @@ def table_readings(
             likely += [(moved, how, evidence, flange, seen, keys, mount) for moved, mount in moves]
     likely.sort(key=lambda each: each[0])
     as_told = [each for each in likely if each[2] == _AS_TOLD][:_MOST]
-    others = [each for each in likely if each[2] != _AS_TOLD][:_MOST]
+    others = list(_once([each for each in likely if each[2] != _AS_TOLD]))[:_MOST]
     for _, how, evidence, flange, seen, keys, mount in as_told + others:
         fitted = _fitted(seen, keys, flange, mount)
         if fitted is not None:
             yield TableReading(table, how, family, pairs, seen, mount, *fitted, evidence)
+
+
+def _once(likely: list[_Likely]) -> Iterator[_Likely]:
+    """Leave out what differs from an earlier one by the unit of all lengths alone."""
+    met = set[object]()
+    for each in likely:
+        _, how, _, _, seen, _, mount = each
+        board = seen.convention
+        ratio = 0.0 if board is None else round(math.log(board.unit_m / how.unit_m), 3)
+        free = board is not None or not seen.square_known
+        alike = (
+            replace(how, unit_m=1.0 if free else how.unit_m),
+            board and replace(board, unit_m=1.0),
+            ratio,
+            mount,
+        )
+        if alike not in met:
+            met.add(alike)
+            yield each
+
+
+def is_as_told(reading: TableReading) -> bool:
+    """Tell whether the convention is the one that the user names."""
+    return reading.told == _AS_TOLD
+
+
+def fitted_again(reading: TableReading, how: Convention, seen: Seen) -> TableReading:
+    """The same tables read another way that fits as well."""
+    keys = [key for key in seen.views if key in reading.pairs]
+    numbers = reading.table.numbers[[reading.pairs[key] for key in keys]]
+    fitted = _fitted(seen, keys, how.poses(numbers), reading.mount)
+    told = next((told for each, told in possible(numbers) if each == how), reading.told)
+    assert fitted is not None
+    return TableReading(reading.table, how, reading.family, reading.pairs, seen, reading.mount, *fitted, told)
 
 
 def _moves(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> float:
@@ -115,7 +194,7 @@ def _moves(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> float:
 
 def _fitted(
     seen: Seen, keys: list[Key], flange: Array, mount: Mount
-) -> tuple[ViewSet, PoseFit, float, float] | None:
+) -> tuple[ViewSet, PoseFit, Array, Array] | None:
     views = tuple(replace(seen.views[key], base_from_flange=F) for key, F in zip(keys, flange, strict=True))
     candidates = [seen.candidates[key] for key in keys]
     viewed = with_poses(ViewSet(mount, views, seen.camera), candidates, seen.board)
@@ -124,27 +203,83 @@ def _fitted(
         fit = fit_poses(poses)
     except np.linalg.LinAlgError:
         return None
-    places = mount_poses(flange, mount) @ fit.X[0] @ poses.boards.at(fit.factors)
-    away = inverse(fit.Y[0]) @ places
-    stays_m = float(np.median(np.linalg.norm(away[:, :3, 3], axis=1)))
-    return viewed, fit, stays_m, float(np.median(rotation_angle(away[:, :3, :3])))
+    return viewed, fit, *_away(fit, mount_poses(flange, mount), poses)
 
 
 def _pose_views(views: ViewSet, seen: Seen) -> PoseViews:
     return pose_views(views, 0.02, 0.003 if seen.square_known else FREE)
 
 
+def without_boards_own(held: Contents, readings: list[TableReading]) -> list[TableReading]:
+    """Leave out tables that tell the board's own motion. ImportSourceError (`boards-own-poses`) where none is
+    left."""
+    own: dict[str, BoardMotion] = {}
+    for reading in readings:
+        if reading.table.name not in own and reading.stays_m < _STAYS_M:
+            boards = reading.views.camera_from_board
+            extent_m = board_extent_m(reading.views)
+            if near := boards_own_motion(reading.views.base_from_flange, boards, extent_m):
+                own[reading.table.name] = near
+    left = [reading for reading in readings if reading.table.name not in own]
+    if own and not any(map(is_good, left)):
+        (name, near), *_ = own.items()
+        away_m, away_rad = near.away_m, near.away_rad
+        raise ImportSourceError(
+            "boards-own-poses", source=held.root, table=name, away_m=away_m, away_rad=away_rad
+        )
+    return left
+
+
 def is_good(reading: TableReading) -> bool:
-    X, factor = reading.fit.X[0], float(reading.fit.factors[0])
-    itself = np.linalg.norm(X[:3, 3]) < 1e-3 and rotation_angle(X[:3, :3]) < 0.01
-    return (
-        reading.stays_m < _STAYS_M
-        and reading.stays_rad < _STAYS_RAD
-        and float((reading.fit.full > 0.5).mean()) > 0.5
-        and not itself
-        and 0.1 < factor < 10
-        and bool(np.linalg.norm(X[:3, 3]) < 20)
-    )
+    """Tell whether the board stays put by a reading, but for few views."""
+    stays = reading.stays_m < _STAYS_M and reading.stays_rad < _STAYS_RAD
+    return stays and float(reading.agree.mean()) > 0.5 and _is_possible(reading)
+
+
+def _is_possible(reading: TableReading) -> bool:
+    away_m, factor = np.linalg.norm(reading.fit.X[0][:3, 3]), float(reading.fit.factors[0])
+    return _SIZES[0] < factor < _SIZES[1] and bool(away_m < _FARTHEST_M)
+
+
+def _leading(one: TableReading, readings: list[TableReading]) -> TableReading | None:
+    """A reading that is right for many views, and that no other one comes near, by those views alone: the
+    rest are outliers. None: it is not so."""
+    lead = _LEAD * clear_gain(len(one.agree))
+    if any(one.log_evidence - other.log_evidence <= lead and not _same(one, other) for other in readings):
+        return None
+    poses = _pose_views(one.views, one.seen)
+    H = mount_poses(one.views.base_from_flange, one.mount)
+    needed = max(_FEWEST_SURE, round(_SURE * len(H)))
+    rng = np.random.default_rng(0)
+    best = np.zeros(len(H), dtype=bool)
+    for _ in range(_STARTS):
+        few = rng.permutation(len(H))[:_FEW]
+        start = agreed_start(H[few], poses.boards.part(few), 0)
+        X, factors = start.X, start.factors
+        for _ in range(_STEPS):
+            places = H @ X @ poses.boards.at(factors)
+            away = pose_distances(places, places)
+            middle = away[np.sort(away, axis=1)[:, needed - 1].argmin()]
+            nearest = np.argsort(middle)[:needed]
+            if middle[nearest[-1]] < _STAYS_M:
+                break
+            start = agreed_start(H[nearest], poses.boards.part(nearest), 0)
+            X, factors = start.X, start.factors
+        alike = middle < _STAYS_M
+        best = alike if alike.sum() > best.sum() else best
+    if best.sum() < needed:
+        return None
+    fit = fit_poses(poses.part(np.flatnonzero(best)))
+    away_m, away_rad = _away(fit, H, poses)
+    inliers = (away_m < _STAYS_M) & (away_rad < _STAYS_RAD)
+    found = replace(one, fit=fit, away_m=away_m[inliers], away_rad=away_rad[inliers], inliers=inliers)
+    return found if _is_possible(found) and inliers.sum() >= _FEWEST_SURE else None
+
+
+def _away(fit: PoseFit, H: Array, poses: PoseViews) -> tuple[Array, Array]:
+    """How far the board is from its place in every view: (n,) metres, (n,) radians."""
+    away = inverse(fit.Y[0]) @ H @ fit.X[0] @ poses.boards.at(fit.factors)
+    return np.linalg.norm(away[:, :3, 3], axis=1), np.asarray(rotation_angle(away[:, :3, :3]))
 
 
 def decide(
@@ -152,17 +287,21 @@ def decide(
 ) -> TableReading:
     """The reading that is clearly best. What the user names is refused where another one is clearly better;
     whose mounting, convention and square are told needs not agree well: the solve judges it."""
-    ranked = sorted(readings, key=lambda r: (not is_good(r), -r.fit.log_evidence))
+    ranked = sorted(readings, key=lambda r: (not is_good(r), -r.log_evidence))
     mine = [reading for reading in ranked if named is None or reading.told == _AS_TOLD]
     if mount and tells_direction(named):
         mine = [reading for reading in mine if reading.mount == mount or reading.seen.convention]
-    beaten = mine and _beats(ranked[0], mine[0])
+    impossible = mine and is_good(ranked[0]) and not _is_possible(mine[0])
+    beaten = mine and (_beats(ranked[0], mine[0]) or impossible)
     if beaten and is_good(ranked[0]):
         fits = replace(ranked[0].convention, inverse=mount not in (None, ranked[0].mount)).name
         raise ImportSourceError("other-convention", source=held.root, told=named, fits=fits)
     if not mine or beaten or not is_good(mine[0]):
         nearest = _nearest([*dict.fromkeys(ranked[:_EXPLAINED] + mine[:_EXPLAINED])])
         as_told = named and mount and mine and mine[0].seen.square_known
+        leading = _leading(mine[0], readings) if mine and not beaten and not nearest["cause"] else None
+        if leading is not None:
+            return leading
         if beaten or not as_told or nearest["cause"]:
             raise ImportSourceError("no-reading", source=held.root, **nearest)
     best = mine[0]
@@ -170,24 +309,51 @@ def decide(
         if _beats(best, other) or is_good(other) != is_good(best):
             break
         if not _same(best, other):
-            both = {"first": best.text, "second": other.text}
-            raise ImportSourceError("two-readings", source=held.root, **both)
+            raise several_readings(held.root, [_as_asked(best), _as_asked(other)], _BY_WRITER)
     return best
 
 
+def _as_asked(reading: TableReading) -> StandingReading:
+    x_mm, y_mm, z_mm = (float(each) for each in 1e3 * reading.fit.X[0][:3, 3])
+    options: dict[str, str] = {"convention": reading.convention.name, "mount": reading.mount}
+    return StandingReading(reading.text, {"poses": reading.table.name} | options, (x_mm, y_mm, z_mm))
+
+
+_BY_WRITER = "The program or pendant that wrote the table decides."
+
+
 def _beats(one: TableReading, other: TableReading) -> bool:
-    return one.fit.log_evidence - other.fit.log_evidence > clear_gain(len(one.fit.full))
+    return one.log_evidence - other.log_evidence > clear_gain(len(one.fit.full))
+
+
+_CHECK_IMAGES = (
+    "Check that the rows are the flange's poses, not joints, and belong to these images; name them by "
+    "--poses and --board. A reading is taken as told, and the solve judges it, where --convention, --mount "
+    "and --board are all given."
+)
+_CHECK_PAIRS = (
+    "Check that both tables were written at the same stops in the same order, and that the robot's holds the "
+    "flange's poses, not joints; name it by --poses. A reading is taken as told, and the solve judges it, "
+    "where --convention and --mount are given."
+)
 
 
 def _nearest(readings: list[TableReading]) -> dict[str, Any]:
     """The reading nearest to right, and what would make it right, as a solve names it."""
     explained = [explain_recording(_pose_views(reading.views, reading.seen)) for reading in readings]
     gains = [found.log_evidence_gain if found.reading in _CAUSES else 0.0 for found in explained]
-    evidence = [reading.fit.log_evidence + gain for reading, gain in zip(readings, gains, strict=True)]
+    evidence = [reading.log_evidence + gain for reading, gain in zip(readings, gains, strict=True)]
     best, found = readings[at := int(np.argmax(evidence))], explained[at]
     cause = found.reading.value if found.reading in _CAUSES else ""
     text = f". {explain_text(found, best.views)}".rstrip(".") if cause else ""
-    near = {"nearest": best.text, "stays_m": best.stays_m, "stays_rad": best.stays_rad}
+    pairs = best.seen.convention is not None
+    near = {
+        "nearest": best.text,
+        "stays_m": best.stays_m,
+        "stays_rad": best.stays_rad,
+        "seen": f"the board's poses, {best.family}" if pairs else "the board in the images",
+        "advice": _CHECK_PAIRS if pairs else _CHECK_IMAGES,
+    }
     return {**near, "cause": cause, "text": text}
 
 

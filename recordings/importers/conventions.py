@@ -10,6 +10,7 @@ import math
 import re
 from dataclasses import dataclass, replace
 from itertools import permutations
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,10 +18,26 @@ from scipy.spatial.transform import Rotation
 from recordings.errors import ImportSourceError
 from recordings.importers.messages import Array
 
+BoardPose = Literal["camera-from-board", "board-from-camera"]
+"""Which way round a table tells where the board was: the board in the camera, or the camera in the board."""
+CameraAxes = Literal["optical", "opengl", "ros"]
+"""Axes of the camera in whose frame a table tells the board: z forward and y down; −z forward and y up
+(OpenGL, Blender); x forward and z up (`camera_link` of ROS)."""
+OPTICAL_FROM_AXES: dict[CameraAxes, list[list[int]]] = {
+    "optical": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "opengl": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "ros": [[0, -1, 0], [0, 0, -1], [1, 0, 0]],
+}
+"""Rotations (3, 3) into the optical frame."""
+UNITS = {"mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
+"""Ends of a convention's name, and metres; without one it is metres."""
+
 _REACH_LIMIT_M = 5.0
-"""A larger median distance from the base is no arm's in metres: such numbers are millimetres."""
+"""A larger median distance from the base is no arm's in metres."""
 _REACH_LEAST_M = 0.01
 """A smaller one is no arm's in the unit that makes it so."""
+_SMALL_REACH_M = 0.15
+"""An arm that reaches no further is so small that its millimetres may be centimetres or inches."""
 _UNIT_TOLERANCE = 0.01
 _TURN = 2 * math.pi + 0.01
 """Larger numbers are no angles in radians."""
@@ -44,7 +61,7 @@ class Convention:
         euler = self.rotation if self.rotation in _FORMS else f"euler-{self.rotation}"
         signs = {
             "deg": self.degrees,
-            "mm": self.unit_m == 1e-3,
+            **{name: self.unit_m == unit_m for name, unit_m in UNITS.items()},
             "first": self.rotation_first,
             "inverse": self.inverse,
         }
@@ -73,7 +90,7 @@ class Convention:
         return Rotation.from_euler(self.rotation, turn, degrees=self.degrees)
 
 
-_MM = 1e-3
+_MM = UNITS["mm"]
 _FORMS = ("matrix", "xyzw", "wxyz", "rotvec")
 _SEQUENCES = [
     turned
@@ -99,11 +116,11 @@ def convention(name: str) -> Convention:
     """The convention of a name. Raises ImportSourceError that lists the names."""
     if name in NAMED:
         return NAMED[name]
-    told = re.fullmatch(r"(?:euler-)?(\w+)((?:-(?:deg|rad|mm|m|first|inverse))*)", name)
+    told = re.fullmatch(r"(?:euler-)?(\w+)((?:-(?:deg|rad|mm|cm|inch|m|first|inverse))*)", name)
     if not told or told[1] not in (*_FORMS, *_SEQUENCES):
         raise ImportSourceError("no-convention", name=name, names=", ".join(NAMED))
     signs = told[2].split("-")
-    unit_m = _MM if "mm" in signs else 1.0
+    unit_m = next((unit_m for unit, unit_m in UNITS.items() if unit in signs), 1.0)
     return Convention(told[1], unit_m, *(sign in signs for sign in ("deg", "inverse", "first")))
 
 
@@ -142,9 +159,17 @@ def _rotations(turn: Array) -> list[tuple[Convention, str]]:
 
 
 def _in_units(found: list[tuple[Convention, str]], at: Array) -> list[tuple[Convention, str]]:
-    reach = float(np.median(np.linalg.norm(at, axis=1)))
-    unit_m = _MM if reach > _REACH_LIMIT_M else 1.0
-    if reach * unit_m < _REACH_LEAST_M:
-        return []
-    told = f"reach {reach:.4g} {'mm' if unit_m == _MM else 'm'}"
-    return [(replace(each, unit_m=unit_m), f"{evidence}, {told}") for each, evidence in found]
+    reaches = np.linalg.norm(at, axis=1)
+    reach, most = float(np.median(reaches)), float(reaches.max())
+    if reach <= _REACH_LIMIT_M:
+        units = {"m": 1.0}
+    elif most * UNITS["mm"] > _SMALL_REACH_M:
+        units = {"mm": UNITS["mm"]}
+    else:
+        units = UNITS
+    return [
+        (replace(each, unit_m=unit_m), f"{evidence}, reach {reach:.4g} {unit}")
+        for unit, unit_m in units.items()
+        if reach * unit_m >= _REACH_LEAST_M
+        for each, evidence in found
+    ]

@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -18,6 +19,7 @@ from recordings import strict_yaml
 from recordings.errors import ImportSourceError, disk_error
 from recordings.files import read_file, session_name_from
 from recordings.image_headers import SIDE_LIMIT_PX
+from recordings.importers.conventions import CameraAxes
 from recordings.schema.boards import board_problem
 from recordings.schema.messages import (
     BoardSpec,
@@ -58,6 +60,8 @@ class PosesTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Table of the arm's joints, of as many rows as that of the poses."""
     source: str = ""
     """The folder of which this is believed: beside a recording it holds of no other."""
+    camera_axes: CameraAxes | Literal[""] = ""
+    """Of the camera in whose frame the board's poses are told; empty: they are taken as they are."""
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

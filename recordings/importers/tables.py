@@ -464,7 +464,7 @@ def _stems(tree: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Poses whose numbers have a name each that begins alike: tcp_x, tcp_y …; pose1, pose2 …"""
     groups = defaultdict[str, dict[str, float]](dict)
     for key, value in tree.items():
-        part = _PART.fullmatch(str(key).lower()) if len(str(key)) <= _TEXT_LIMIT else None
+        part = _PART.fullmatch(_plain_key(str(key))) if len(str(key)) <= _TEXT_LIMIT else None
         if part and part[1] and isinstance(value, (int, float)):
             groups[part[1]][part[2]] = value
     for stem, parts in groups.items():
@@ -517,7 +517,7 @@ def _pose(value: Any) -> tuple[list[float], str, str] | None:
 
 def _plain_key(key: str) -> str:
     """A key without its unit."""
-    return re.sub(r"\(.*|_?(m|mm|deg|rad)$", "", key.lower())
+    return re.sub(r"[ _]?\(.*|_?(m|mm|cm|deg|rad)$|_(in|inch|inches)$", "", key.lower())
 
 
 def _half(node: _Node) -> tuple[list[float], str, str] | None:

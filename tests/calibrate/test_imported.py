@@ -21,6 +21,7 @@ from calibrate.job import JobOptions, solve_recording
 from calibrate.kinematics import MODELS
 from calibrate.report.page import report_page
 from recordings.cli import main
+from recordings.errors import SeveralReadingsError
 from recordings.importers.conventions import possible
 from recordings.importers.tables import look
 from recordings.reader import open_recording
@@ -30,6 +31,7 @@ from tests.calibrate.pose_files import (
     HOLDERS,
     IMAGES,
     PAIRS,
+    euler,
     in_two_tables,
     kuka,
     quaternions,
@@ -207,8 +209,29 @@ def test_a_mistake_is_named_or_read_as_meant(
 def test_the_boards_own_poses_are_not_taken_for_the_robots(put: Callable[..., Path]) -> None:
     """They agree with the images perfectly."""
     camera_from_board = np.array(TURNED.camera_from_board())
-    with raises("no-reading"):
+    with raises("boards-own-poses", table="robot_pose.csv"):
         believe(look(put(kuka, lambda T: camera_from_board)))
+
+
+def test_centimetres_are_told_by_a_board_and_asked_about_without_one(
+    put: Callable[..., Path], images: tuple[Path, np.ndarray]
+) -> None:
+    """No arm ends at 80 mm."""
+
+    def centimetres(folder: Path, T: np.ndarray) -> None:
+        np.savetxt(folder / "tcp_pose.csv", euler("ZYX", 1e2, True)(T), delimiter=",")
+
+    folder, board_told = put(centimetres), TURNED.board
+    with raises("several-readings") as asked:
+        believe(look(folder))
+    assert isinstance(asked.value, SeveralReadingsError)
+    answers = [believe(look(folder), Given(**each.options)) for each in asked.value.readings]
+    for found in (*answers[:1], believe(look(folder), Given(board=board_told))):
+        by_name = {row.image: row.base_from_flange for row in found.rows}
+        np.testing.assert_allclose(
+            [by_name[f"{n}.png"] for n in range(1, len(images[1]) + 1)], images[1], atol=1e-6
+        )
+    assert answers[0].dataset.board.square_m == pytest.approx(board_told.square_m, rel=0.02)
 
 
 def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_path: Path) -> None:

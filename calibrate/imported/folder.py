@@ -22,6 +22,7 @@ from calibrate.imported.sets import (
     PairSet,
     are_rivals,
     are_sessions,
+    boards_named,
     image_sets,
     pair_sets,
     pairs_of,
@@ -178,7 +179,9 @@ def _pair_readings(
     held: Contents, robots: list[Table], given: Given, progress: Progress
 ) -> list[TableReading]:
     """Readings of the one set of tables that is good, else of all. ImportSourceError where several are."""
-    boards = [t for t in held.tables if t.whose == "board" or (held.told and t.whose == "")]
+    boards = boards_named(held, given.images) or [
+        table for table in held.tables if table.whose == "board" or (held.told and table.whose == "")
+    ]
     sets = pair_sets(robots, boards)
     good: list[tuple[PairSet, list[TableReading]]] = []
     tried: list[TableReading] = []

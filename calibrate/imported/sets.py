@@ -66,7 +66,7 @@ def image_sets(held: Contents, robots: list[Table], told: str | None) -> list[Im
 
     `told`: the images that the user names. Raises ImportSourceError where none is named so.
     """
-    meant = _families(held, told)
+    meant = {} if boards_named(held, told) else _families(held, told)
     families = held.images | meant
     fits = {
         (family, robot.name): pairs
@@ -83,6 +83,13 @@ def image_sets(held: Contents, robots: list[Table], told: str | None) -> list[Im
         for family in meant
     ]
     return sorted((each for each in sets if each.rows), key=lambda each: (each.is_made, each.family))
+
+
+def boards_named(held: Contents, told: str | None) -> list[Table]:
+    """The tables of board poses that the user names instead of images; empty: none is named so."""
+    if told is None:
+        return []
+    return [table for table in held.tables if table.whose != "robot" and table.name == told]
 
 
 def pair_sets(robots: list[Table], boards: list[Table]) -> list[PairSet]:

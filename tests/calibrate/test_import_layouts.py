@@ -463,6 +463,27 @@ def test_the_question_is_for_programs_too(shots: Shots, tmp_path: Path) -> None:
 # ---- pairs without images
 
 
+@pytest.mark.parametrize("name", ["s{n}/{of}.txt", "{of}_run{n}.csv", "day {n}/data/{of}.txt"])
+def test_sessions_of_pairs_are_never_mixed(name: str, tmp_path: Path) -> None:
+    scenes = {n: Scene(views=12, seed=n) for n in (1, 2)}
+    for n, scene in scenes.items():
+        for of, poses in (("robot", scene.flange_poses()[0]), ("marker", scene.camera_from_board())):
+            path = tmp_path / name.format(n=n, of=of)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(path, quaternions(np.array(poses)))
+    given = Given(mount="eye-in-hand")
+    with raises("several-sets", AmbiguousSourceError, option="--images") as asked:
+        believe(look(tmp_path), given)
+    choices = asked.value.values["choices"]
+    assert isinstance(choices, list)
+    for choice, scene in zip(choices, scenes.values(), strict=True):
+        rows = believe(look(tmp_path), replace(given, images=choice)).rows
+        np.testing.assert_allclose([row.base_from_flange for row in rows], scene.flange_poses()[0], atol=1e-6)
+        np.testing.assert_allclose(
+            [row.camera_from_board for row in rows], scene.camera_from_board(), atol=1e-6
+        )
+
+
 def camodocals(folder: Path, robot: np.ndarray, seen: np.ndarray, name: str = "T{of}_{n}") -> None:
     rows = {}
     for n in range(len(robot)):

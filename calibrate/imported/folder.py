@@ -347,28 +347,28 @@ def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
 def _unused(held: Contents, used: set[str]) -> list[str]:
     """Files that were seen and not used, one line a kind: data by name, what is never read by suffix."""
     tables = {table.files for table in held.tables}
-    lines: list[str] = []
+    kinds = defaultdict[tuple[str, str], int](int)
     others = Counter[str]()
-    for name, count in held.files.items():
-        if name in used:
+    for name, alike in held.files.items():
+        if not used.isdisjoint((name, alike)):
             continue
-        counted = f"{count} {name}" if count > 1 else name
-        if name in held.unread:
-            lines.append(f"{counted}: {held.unread[name]}")
-        elif name in held.images:
-            lines.append(f"{counted}: images")
-        elif name in tables:
-            lines.append(f"{counted}: numbers like poses")
+        if alike in held.unread:
+            kinds[alike, held.unread[alike]] += 1
+        elif alike in held.images:
+            kinds[alike, "images"] += 1
+        elif not tables.isdisjoint((name, alike)):
+            kinds[alike, "numbers like poses"] += 1
         elif name in held.described_by:
-            lines.append(f"{counted}: says something of a board or camera")
+            kinds[alike, "says something of a board or camera"] += 1
         elif Path(name).suffix in DATA_SUFFIXES:
-            lines.append(f"{counted}: no table of poses, no board, no camera")
+            kinds[alike, "no table of poses, no board, no camera"] += 1
         else:
-            others[Path(name).suffix or Path(name).name] += count
-    lines += [f"{name}, {todo}" for name, todo in held.unread.items() if name not in held.files]
+            others[Path(name).suffix or Path(name).name] += 1
+    lines = [f"{count} {name}: {what}" for (name, what), count in kinds.items()]
+    lines += [f"{name}, {todo}" for name, todo in held.unread.items() if name not in held.files.values()]
     if others:
-        kinds = ", ".join(f"{count} {kind}" for kind, count in others.most_common())
-        lines.append(f"never read: {kinds}")
+        suffixes = ", ".join(f"{count} {suffix}" for suffix, count in others.most_common())
+        lines.append(f"never read: {suffixes}")
     return lines
 
 

@@ -114,7 +114,7 @@ class FolderRead(msgspec.Struct, frozen=True, tag=True):
     cameras: list[tuple[list[list[float]], tuple[float, ...]]]
     facts: dict[str, str | int | float | bool | list[float] | None]
     words: str
-    files: dict[str, int]
+    files: dict[str, str]
     described_by: set[str]
     unread: dict[str, str]
     told: list[int] | None

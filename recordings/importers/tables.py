@@ -105,7 +105,7 @@ class Table:
     places: list[tuple[int, ...]]
     """Numbers in the row's file name and place, its order."""
     files: str = ""
-    """The files that hold it, digits that tell rows apart as #."""
+    """The file that holds it, or files of one row each, with # for the digits that tell them apart."""
 
     @property
     def whose(self) -> str:
@@ -132,8 +132,8 @@ class Contents:
     """Values of leaves that describe a board, by lower-case key."""
     words: str = ""
     """The folder's last names, names of files and keys: what may say how the camera is mounted."""
-    files: dict[str, int] = field(default_factory=dict)
-    """All files, digits that tell them apart as # → how many."""
+    files: dict[str, str] = field(default_factory=dict)
+    """All files → their name with # for the digits that tell them apart."""
     described_by: set[str] = field(default_factory=set)
     """Those of them that say something of camera or board."""
     unread: dict[str, str] = field(default_factory=dict)
@@ -172,7 +172,8 @@ def look(
     folded = _folded([path.relative_to(root) for path in files])
     for path in files if file is None or file.is_relative_to(root) else [*files, file]:
         alike = folded[path.relative_to(root)] if path.is_relative_to(root) else _pattern(path.name)
-        found.files[alike] = found.files.get(alike, 0) + 1
+        name = str(path.relative_to(root)) if path.is_relative_to(root) else path.name
+        found.files[name] = alike
         if path.suffix.lower() in IMAGE_SUFFIXES:
             found.images.setdefault(alike, []).append(path)
             continue
@@ -203,12 +204,11 @@ def look(
             continue
         if not nodes:
             continue
-        name = str(path.relative_to(root)) if path.is_relative_to(root) else path.name
         words.append(name)
         told = defaultdict[tuple[str, ...], list[_Row]](list)
         for node in nodes:
             if _facts(node, found):
-                found.described_by.add(alike)
+                found.described_by.add(name)
             words.extend(node.keys[-1:])
             if isinstance(node.value, str):
                 words.append(node.value[:60])
@@ -219,7 +219,10 @@ def look(
                 is_told = file in (path, *path.parents)
                 told[key].append(_Row(numbers, node.image, place, is_told, alike))
         for (named, *form), each in told.items():  # files of one row each make a table together
-            rows[f"{alike if len(each) == 1 else name} {named}".strip(), *form].extend(each)
+            holder = alike if len(each) == 1 else name
+            for single in each:
+                single.file = holder
+            rows[f"{holder} {named}".strip(), *form].extend(each)
     words = words[:_WORDS_LIMIT]
     words += [re.sub("[- ]", "_", word) for word in words]
     found.words = " ".join(dict.fromkeys(words))

@@ -574,6 +574,14 @@ def test_many_files_of_a_kind_are_one_line(shots: Shots, tmp_path: Path) -> None
     assert all("20" in line for line in lines_told)
 
 
+def test_another_table_beside_the_one_that_is_used_is_named(shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    for n, scene in ((1, "one"), (2, "two")):
+        np.savetxt(tmp_path / f"robot_{n}.csv", quaternions(shots.flanges[scene]))
+    assert require_right(shots, tmp_path) == {"one"}
+    assert len(believe(look(tmp_path), GIVEN).unused) == 1
+
+
 # ---- what others left
 
 RIGHT = ("csv-with-header-names-not-used", "date-behind-the-pose", "one-folder-a-pose")

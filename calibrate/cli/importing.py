@@ -28,7 +28,6 @@ from recordings.errors import (
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, import_bag
 from recordings.importers.bags import BAGS, UNFINISHED
-from recordings.importers.conventions import BoardPose, CameraAxes
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
 from recordings.importers.folder import Imported, import_folder, write_views
 from recordings.importers.messages import Progress
@@ -36,7 +35,7 @@ from recordings.importers.reader import look
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import StandstillLimits
 from recordings.plain_text import plain_text
-from recordings.schema.messages import Mount
+from recordings.schema.messages import BoardPose, CameraAxes, Mount
 from recordings.schema.stillness import POSITION_M, ROTATION_RAD
 
 

@@ -39,8 +39,6 @@ from recordings.errors import AmbiguousSourceError, ImportSourceError
 from recordings.image_headers import ImageError, read_header
 from recordings.importers.conventions import (
     OPTICAL_FROM_AXES,
-    BoardPose,
-    CameraAxes,
     Convention,
     convention,
     tells_direction,
@@ -50,7 +48,15 @@ from recordings.importers.image_files import header_bytes
 from recordings.importers.messages import Progress
 from recordings.importers.tables import Contents, Table
 from recordings.importers.trees import DATA_SUFFIXES
-from recordings.schema.messages import LARGEST_TOLERANCE, BoardSpec, CameraModel, Matrix4, Mount
+from recordings.schema.messages import (
+    LARGEST_TOLERANCE,
+    BoardPose,
+    BoardSpec,
+    CameraAxes,
+    CameraModel,
+    Matrix4,
+    Mount,
+)
 
 LEAST_GUESSED_TOLERANCE = 0.003
 """Relative: no guess from some images is nearer than what a board is printed to."""

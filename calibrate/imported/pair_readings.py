@@ -25,12 +25,10 @@ from recordings.errors import SeveralReadingsError, StandingReading, several_rea
 from recordings.importers.conventions import (
     OPTICAL_FROM_AXES,
     UNITS,
-    BoardPose,
-    CameraAxes,
     Convention,
 )
 from recordings.importers.tables import Contents
-from recordings.schema.messages import Mount
+from recordings.schema.messages import BoardPose, CameraAxes, Mount
 
 _AHEAD = 0.9
 """Share of the rows that have the board before the camera, where its axes are optical."""

@@ -10,19 +10,14 @@ import math
 import re
 from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError
 from recordings.importers.messages import Array
+from recordings.schema.messages import CameraAxes
 
-BoardPose = Literal["camera-from-board", "board-from-camera"]
-"""Which way round a table tells where the board was: the board in the camera, or the camera in the board."""
-CameraAxes = Literal["optical", "opengl", "ros"]
-"""Axes of the camera in whose frame a table tells the board: z forward and y down; −z forward and y up
-(OpenGL, Blender); x forward and z up (`camera_link` of ROS)."""
 OPTICAL_FROM_AXES: dict[CameraAxes, list[list[int]]] = {
     "optical": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     "opengl": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],

@@ -19,10 +19,10 @@ from recordings import strict_yaml
 from recordings.errors import ImportSourceError, disk_error
 from recordings.files import read_file, session_name_from
 from recordings.image_headers import SIDE_LIMIT_PX
-from recordings.importers.conventions import CameraAxes
 from recordings.schema.boards import board_problem
 from recordings.schema.messages import (
     BoardSpec,
+    CameraAxes,
     CameraIdentity,
     CameraModel,
     Joints,

@@ -17,6 +17,11 @@ if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
     from numpy.typing import NDArray
 
 Mount = Literal["eye-in-hand", "eye-to-hand"]
+BoardPose = Literal["camera-from-board", "board-from-camera"]
+"""Which way round a table tells where the board was: the board in the camera, or the camera in the board."""
+CameraAxes = Literal["optical", "opengl", "ros"]
+"""Axes of the camera in whose frame a table tells the board: z forward and y down; −z forward and y up
+(OpenGL, Blender); x forward and z up (`camera_link` of ROS)."""
 Source = Literal["real", "simulated", "playback", "imported"]
 """Origin of images and poses; anything but `real` never installs on a real cell."""
 

@@ -24,10 +24,10 @@ from calibrate.imported.directions import Told, directions, unit_named
 from calibrate.views import NO_CORNERS, BoardView, ViewSet
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
-from recordings.importers.conventions import OPTICAL_FROM_AXES, CameraAxes
+from recordings.importers.conventions import OPTICAL_FROM_AXES
 from recordings.importers.tables import look
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, Mount
+from recordings.schema.messages import CameraAxes, CameraModel, Mount
 from tests.calibrate.pose_files import quaternions
 from tests.codes import raises
 from tests.command_line import call

@@ -108,7 +108,7 @@ def flange_extent(flange: Array) -> Array:
     return np.append(middle, max(float(away), 1e-9))
 
 
-_LINKS = 4.0
+LINKS = 4.0
 """Errors of the flange as multiples of one link's: five links add up to √5, their levers to about as much
 again. A power of two moves the sizes that are averaged over by whole steps, and X by nothing."""
 
@@ -121,7 +121,7 @@ def smooth_motion(flange: Array, extent: Array) -> Array:
     """
     place = (flange[:, :3, 3] - extent[:3]) / extent[3]
     i, j = np.triu_indices(3)
-    terms = _LINKS * np.concatenate([place, place[:, i] * place[:, j]], axis=1)
+    terms = LINKS * np.concatenate([place, place[:, i] * place[:, j]], axis=1)
     return np.asarray(np.einsum("nk,ab->nakb", terms, np.eye(6)).reshape(len(flange), 6, -1))
 
 

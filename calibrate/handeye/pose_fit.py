@@ -246,9 +246,9 @@ def fit_poses(views: PoseViews, seed: int = 0) -> PoseFit:
     X, Y, factors = _start(views, seed)
     scales: Scales | None = None
     for _ in range(MAX_STEPS):
-        linear = _linearise(views, X, Y, factors)
+        linear = linearise(views, X, Y, factors)
         scales = scales or linear.first_scales()
-        solved = linear.solve(_prior(views.boards, len(X) + len(Y), factors), scales, "robot")
+        solved = linear.solve(pose_prior(views.boards, len(X) + len(Y), factors), scales, "robot")
         scales, step = solved.scales, solved.step
         at_Y, at_factors = 6 * len(X), 6 * (len(X) + len(Y))
         X = perturb(X, step[:at_Y].reshape(-1, 6))
@@ -279,7 +279,7 @@ def _start(views: PoseViews, seed: int) -> tuple[Array, Array, Array]:
     return both, start.Y[None], start.factors
 
 
-def _prior(boards: BoardPoses, poses: int, factors: Array) -> Quadratic:
+def pose_prior(boards: BoardPoses, poses: int, factors: Array) -> Quadratic:
     """Make the prior of X and Y (1 m, 1 rad) and of the factors; `BoardPoses.open` ones have none."""
     precision = np.concatenate([np.full(6 * poses, 1e-6), boards.sigma**-2.0])
     precision[6 * poses + boards.open] = 1e-9
@@ -290,7 +290,7 @@ def _prior(boards: BoardPoses, poses: int, factors: Array) -> Quadratic:
     return Quadratic(np.diag(precision), -precision * miss, log)
 
 
-def _linearise(views: PoseViews, X: Array, Y: Array, factors: Array) -> Linear:
+def linearise(views: PoseViews, X: Array, Y: Array, factors: Array) -> Linear:
     n = len(views)
     later = np.zeros(n, dtype=np.intp) if views.later is None else views.later.astype(np.intp)
     of_X, of_Y = later * (len(X) > 1), later * (len(Y) > 1)

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibrate.geometry import (
@@ -23,7 +22,8 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_log,
 )
-from calibrate.handeye.pose_fit import FREE, BoardPoses, Moved, PoseFit, PoseViews, fit_poses
+from calibrate.handeye.changes import ChangeSearch, errors_by_posture, is_claimed
+from calibrate.handeye.pose_fit import FREE, BoardPoses, PoseFit, PoseViews, fit_poses
 from calibrate.handeye.solution import Explanation, Reading
 from calibrate.views import ViewSet
 
@@ -41,29 +41,61 @@ _LEAST = 0.01
 """Relative distance of a factor from 1 below which it is a tolerance, not another reading."""
 
 
-_FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL, Reading.REFOCUSED: -1}
+CHANGES = (Reading.BOARD_MOVED, Reading.CAMERA_MOVED, Reading.REFOCUSED)
+"""What happens between two views; all else is so from the first view on."""
+_FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL}
 
 
-def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
-    """Find the reading with the most evidence; AS_RECORDED unless another one is clearly better."""
+def explain_recording(views: PoseViews, seed: int = 0, by_links: Array | None = None) -> Explanation:
+    """Find the reading with the most evidence; AS_RECORDED unless another one is clearly better.
+
+    by_links: (n, 6, p) motion of the flange by errors of the arm's links, where its kinematics are known.
+    """
     as_recorded = _fit(views, seed)
     base = -np.inf if as_recorded is None else as_recorded.log_evidence
-    best = Explanation(Reading.AS_RECORDED, 0.0)
+    best = explain_changes(views, seed, by_links, as_recorded)
     winning = clear_gain(len(views))
-    for reading, changed, at, charge in _readings(views, as_recorded):
+    for reading, changed, at, charge in _readings(views):
         fit = _fit(changed, seed)
         if fit is None:
             continue
         gain = fit.log_evidence - charge - base
         if np.isfinite(gain) and gain > max(winning, best.log_evidence_gain):
             factor = float(fit.factors[_FACTOR[reading]]) if reading in _FACTOR else 1.0
-            before = float(fit.factors[_FOCAL]) if reading is Reading.REFOCUSED else 1.0
-            if factor <= 0 or (reading in _FACTOR and abs(np.log(factor / before)) < _LEAST):
+            if factor <= 0 or (reading in _FACTOR and abs(np.log(factor)) < _LEAST):
                 continue
             if reading is Reading.SQUARE_SIZE and abs(abs(np.log(factor)) - np.log(1000.0)) < _NEAR:
                 reading = Reading.MILLIMETRES
-            best = Explanation(reading, float(gain), at, factor)
+            best = Explanation(reading, float(gain), at, factor=factor)
     return replace(best, at=0, order=_ORDERS[best.at]) if best.reading is Reading.EULER_ORDER else best
+
+
+def explain_changes(
+    views: PoseViews, seed: int = 0, by_links: Array | None = None, as_recorded: PoseFit | None = None
+) -> Explanation:
+    """Tell whether camera, board or focus changed between two views; AS_RECORDED where that is not clear.
+
+    as_recorded: the fit without a change, where there is one already.
+    """
+    none = Explanation(Reading.AS_RECORDED, 0.0)
+    as_recorded = as_recorded or _fit(views, seed)
+    if as_recorded is None:
+        return none
+    errors = errors_by_posture(views.flange, by_links)
+    try:
+        found = ChangeSearch(views, errors, as_recorded, seed).found()
+    except np.linalg.LinAlgError:
+        return none
+    likeliest = max(found, key=lambda change: change.log_bayes, default=None)
+    if likeliest is None or not is_claimed(likeliest.log_bayes):
+        return none
+    return Explanation(
+        likeliest.reading,
+        likeliest.log_bayes,
+        likeliest.at,
+        (likeliest.first, likeliest.last),
+        likeliest.factor,
+    )
 
 
 def clear_gain(views: int) -> float:
@@ -78,9 +110,7 @@ def _fit(views: PoseViews, seed: int) -> PoseFit | None:
         return None
 
 
-def _readings(
-    views: PoseViews, as_recorded: PoseFit | None
-) -> Iterator[tuple[Reading, PoseViews, int, float]]:
+def _readings(views: PoseViews) -> Iterator[tuple[Reading, PoseViews, int, float]]:
     """Yield each reading, its views, `Explanation.at` (place in `_ORDERS`), log evidence to subtract."""
     for reading, change in _CONVENTIONS.items():
         yield reading, replace(views, flange=change(views.flange)), 0, 0.0
@@ -93,46 +123,12 @@ def _readings(
     yield Reading.SQUARE_SIZE, replace(views, boards=_let_free(views.boards, _SIZE)), 0, 0.0
     if len(views.boards.sigma) > _FOCAL:
         yield Reading.FOCAL_LENGTH, replace(views, boards=_let_free(views.boards, _FOCAL)), 0, 0.0
-    for at in _changes(views, as_recorded):
-        later = np.arange(len(views)) >= at
-        moved: Moved
-        for reading, moved in ((Reading.BOARD_MOVED, "board"), (Reading.CAMERA_MOVED, "camera")):
-            yield reading, replace(views, later=later, moved=moved), at, 0.0
-        if len(views.boards.sigma) > _FOCAL:
-            yield Reading.REFOCUSED, replace(views, boards=_refocused(views.boards, later)), at, 0.0
-
-
-def _changes(views: PoseViews, as_recorded: PoseFit | None) -> list[int]:
-    """List indices at which something may have moved: where view weights change most, and the middle."""
-    n = len(views)
-    places = np.arange(_FEWEST_PER_PART, n - _FEWEST_PER_PART + 1)
-    if not len(places):
-        return []
-    chosen = [n // 2]
-    if as_recorded is not None:
-        weight = as_recorded.full
-        total = np.cumsum(weight)[places - 1]
-        left, right = total / places, (weight.sum() - total) / (n - places)
-        parted = (left - right) ** 2 * places * (n - places)
-        chosen = [*places[np.argsort(-parted)[:3]].tolist(), *chosen]
-    return list(dict.fromkeys(chosen))
 
 
 def _let_free(boards: BoardPoses, factor: int) -> BoardPoses:
     sigma = boards.sigma.copy()
     sigma[factor] = FREE
     return replace(boards, sigma=sigma)
-
-
-def _refocused(boards: BoardPoses, later: NDArray[np.bool_]) -> BoardPoses:
-    """Give views before and after a change a focal length each; the last factor is that of the later ones."""
-    focal = boards.motion[_FOCAL]
-    parts = np.stack([focal * ~later[:, None], focal * later[:, None]])
-    return replace(
-        boards,
-        motion=np.concatenate([boards.motion[:_FOCAL], parts]),
-        sigma=np.array([*boards.sigma[:_FOCAL], FREE, FREE]),
-    )
 
 
 def _mirrored(boards: BoardPoses) -> BoardPoses:
@@ -234,7 +230,6 @@ _WHAT_MOVED = {
 
 def explain_text(session: Explanation, views: ViewSet) -> str:
     """Tell in at most two sentences how the recording reads and what to do."""
-    first = views.views[0 if session.reading is Reading.SHIFTED else session.at]
     return _TEXTS[session.reading].format(
         factor=session.factor,
         order=session.order,
@@ -242,5 +237,14 @@ def explain_text(session: Explanation, views: ViewSet) -> str:
         later="later" if session.at > 0 else "earlier",
         in_mm="robot positions" if session.factor > 1 else "square sizes",
         moved=_WHAT_MOVED.get((session.reading, views.mount), ""),
-        where=f"from view {first.index + 1} ({first.name}) on",
+        where=_where(session, views),
     )
+
+
+def _where(session: Explanation, views: ViewSet) -> str:
+    """Tell the first view after a change, and between which views it is."""
+    if session.reading not in CHANGES:
+        return ""
+    at, first, last = (views.views[place] for place in (session.at, *session.between))
+    place = f"from view {at.index + 1} ({at.name}) on"
+    return place if first is last else f"{place} (the first is one of {first.index + 1} to {last.index + 1})"

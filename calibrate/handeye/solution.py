@@ -156,6 +156,8 @@ class Explanation:
     """Gain over the recording as it stands."""
     at: int = 0
     """Index of the first view after a change; for shifted images, by how many poses."""
+    between: tuple[int, int] = (0, 0)
+    """Indices between which the first view after a change is, with a probability of 95 %."""
     factor: float = 1.0
     """True over configured size of the squares, or focal length, of the later part where it changed."""
     order: tuple[str, str] = ("", "")

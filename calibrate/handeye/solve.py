@@ -64,7 +64,7 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.posterior import posterior_of
 from calibrate.handeye.priors import LensPrior, Priors
-from calibrate.handeye.readings import explain_recording, explain_text
+from calibrate.handeye.readings import explain_changes, explain_recording, explain_text
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.handeye.solution import (
     ArmErrors,
@@ -82,7 +82,7 @@ from calibrate.views import ViewSet, array_of
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 
 _ENOUGH = 0.9
-"""Share of views with full weight above which no other reading of the recording is tried."""
+"""Share of views with full weight above which only a change between two views is looked for."""
 _NOISY_M, _NOISY_RAD = 0.002, float(np.radians(0.3))
 """Robot noise, 1σ, that is larger than a sound arm's."""
 _FREE_FOCAL = 0.02
@@ -118,9 +118,11 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         raise PosesDisagreeError(
             hypothesis=session.reading.value, **problem.values | {"advice": explain_text(session, views)}
         ) from None
-    solution, session = _describe(fit, options), Explanation(Reading.AS_RECORDED, 0.0)
-    if float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH or _doubtful(solution):
-        session = explain_recording(poses, options.seed)
+    solution = _describe(fit, options)
+    by_links = None if fit.arm is None else fit.arm.chain.by_links(fit.arm.joints_rad)
+    disagree = float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH
+    explain = explain_recording if disagree or _doubtful(solution) else explain_changes
+    session = explain(poses, options.seed, by_links)
     return replace(solution, session=session, warnings=_remarks(fit, solution, session))
 
 

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from calibrate.blas_threads import one_blas_thread
-from calibrate.boards.model import check_board
+from calibrate.boards.model import check_board, has_markers
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError, require_choice
 from calibrate.files.calibration import Calibration
@@ -162,6 +162,7 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
         intrinsics_from_same_pictures=prepared.intrinsics is not None,
         lens_sigma=_lens_sigma(options, prepared.views.camera),
         board=BoardTolerance.of(prepared.loaded.board),
+        unmirrored=has_markers(prepared.loaded.board),
         working_distance_m=options.working_distance_m,
         robot_accuracy_m=options.robot_accuracy_m,
         robot_accuracy_rad=options.robot_accuracy_rad,

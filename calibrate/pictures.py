@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from calibrate.blas_threads import one_blas_thread
 from calibrate.boards.detect import detect
-from calibrate.boards.model import board_points, check_board, typed_board
+from calibrate.boards.model import board_points, check_board, has_markers, typed_board
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.gates import judge
 from calibrate.geometry import Array
@@ -180,6 +180,7 @@ def solve(
         options,
         intrinsics_from_same_pictures=intrinsics is not None,
         board=BoardTolerance.of(board, options.board),
+        unmirrored=has_markers(board),
     )
     solution = solve_views(found, options)
     return SolvedPictures(found, solution, judge(solution), without)

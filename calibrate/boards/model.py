@@ -49,6 +49,11 @@ def check_board(spec: BoardSpec) -> None:
             raise BoardError("dictionary-too-small", needed=needed, held=held, dictionary=dictionary)
 
 
+def has_markers(spec: BoardSpec) -> bool:
+    """Tell whether the board is found by markers: in a mirrored image it is not."""
+    return spec.kind in (*SINGLE_TAGS, BoardKind.CHARUCO, BoardKind.APRIL_GRID)
+
+
 def usual_markers(kind: BoardKind, square_m: float) -> tuple[float | None, str | None]:
     """Choose `marker_m` and dictionary of a board of which only the squares are stated; None: it has none."""
     if kind is BoardKind.CHARUCO:

@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -23,9 +24,10 @@ from calibrate.geometry import (
     rotation_log,
 )
 from calibrate.handeye.changes import ChangeSearch, errors_by_posture, is_claimed
-from calibrate.handeye.pose_fit import FREE, BoardPoses, PoseFit, PoseViews, fit_poses
-from calibrate.handeye.solution import Explanation, Reading
-from calibrate.views import ViewSet
+from calibrate.handeye.corner_fit import fit_corners
+from calibrate.handeye.pose_fit import FREE, BoardPoses, PoseFit, PoseViews, fit_poses, pose_views
+from calibrate.handeye.solution import Explanation, Reading, Rival
+from calibrate.views import ViewSet, observe_views
 
 _CLEAR = 10.0
 """Log evidence, besides the logarithm of the number of views, by which another reading has to win."""
@@ -43,31 +45,140 @@ _LEAST = 0.01
 
 CHANGES = (Reading.BOARD_MOVED, Reading.CAMERA_MOVED, Reading.REFOCUSED)
 """What happens between two views; all else is so from the first view on."""
+_SOUND_RAD, _FAR_M = float(np.radians(0.3)), 0.01
+"""Noise of orientations of an arm that is sound, and of positions that agree nowhere."""
+_LARGER = (1.25, 4 / 3, 1.5, 1.6, 2.0, 2.25, 2.5, 3.0, 4.0)
+_SCALES = (1.0, *_LARGER, *(1 / scale for scale in _LARGER))
+"""Sizes of images beside each other: whole, halved, and from one usual format to the next."""
+_MIDDLE = 0.1
+"""Relative distance of a lens's principal point from the middle of its image that is usual."""
 _FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL}
 
 
-def explain_recording(views: PoseViews, seed: int = 0, by_links: Array | None = None) -> Explanation:
+def explain_recording(
+    views: PoseViews,
+    seed: int = 0,
+    by_links: Array | None = None,
+    unmirrored: bool = False,
+    pictured: ViewSet | None = None,
+) -> Explanation:
     """Find the reading with the most evidence; AS_RECORDED unless another one is clearly better.
 
     by_links: (n, 6, p) motion of the flange by errors of the arm's links, where its kinematics are known.
+    unmirrored: the board was found by markers, which no mirrored image shows. pictured: the same views with
+    their corners, from which board poses for another lens are computed.
     """
     as_recorded = _fit(views, seed)
     base = -np.inf if as_recorded is None else as_recorded.log_evidence
-    best = explain_changes(views, seed, by_links, as_recorded)
-    winning = clear_gain(len(views))
+    held = [explain_changes(views, seed, by_links, as_recorded)]
     for reading, changed, at, charge in _readings(views):
-        fit = _fit(changed, seed)
-        if fit is None:
+        if unmirrored and reading is Reading.MIRRORED:
             continue
-        gain = fit.log_evidence - charge - base
-        if np.isfinite(gain) and gain > max(winning, best.log_evidence_gain):
-            factor = float(fit.factors[_FACTOR[reading]]) if reading in _FACTOR else 1.0
-            if factor <= 0 or (reading in _FACTOR and abs(np.log(factor)) < _LEAST):
-                continue
-            if reading is Reading.SQUARE_SIZE and abs(abs(np.log(factor)) - np.log(1000.0)) < _NEAR:
-                reading = Reading.MILLIMETRES
-            best = Explanation(reading, float(gain), at, factor=factor)
-    return replace(best, at=0, order=_ORDERS[best.at]) if best.reading is Reading.EULER_ORDER else best
+        fit = _fit(changed, seed)
+        if fit is not None:
+            held.append(_explanation(reading, fit, at, fit.log_evidence - charge - base))
+    held += _of_other_base(views, as_recorded, seed)
+    if pictured is not None:
+        held += _of_other_resolution(views, pictured, base, seed)
+    found = _named(held, clear_gain(len(views)))
+    if found.reading is Reading.AS_RECORDED and as_recorded is not None and _only_positions(as_recorded):
+        return replace(found, reading=Reading.POSITIONS_DISAGREE)
+    return found
+
+
+def _explanation(reading: Reading, fit: PoseFit, at: int, gain: float) -> Explanation:
+    """Put a fitted reading into the form in which it is held against others; as recorded where it is none."""
+    factor = float(fit.factors[_FACTOR[reading]]) if reading in _FACTOR else 1.0
+    if factor <= 0 or (reading in _FACTOR and abs(np.log(factor)) < _LEAST):
+        return Explanation(Reading.AS_RECORDED, 0.0)
+    if reading is Reading.SQUARE_SIZE and abs(abs(np.log(factor)) - np.log(1000.0)) < _NEAR:
+        reading = Reading.MILLIMETRES
+    if reading is Reading.EULER_ORDER:
+        return Explanation(reading, float(gain), order=_ORDERS[at])
+    return Explanation(reading, float(gain), at=at, factor=factor)
+
+
+def _named(held: list[Explanation], winning: float) -> Explanation:
+    """Name the reading with the most evidence, held against the others.
+
+    A change between two views has its own test, and comes only where it passed. Any other reading has to win
+    by `winning`. A rival is excluded by the same probability as a change that was none.
+    """
+    able = [one for one in held if np.isfinite(one.log_evidence_gain)]
+    able.sort(key=lambda one: -one.log_evidence_gain)
+    best = next((one for one in able if one.reading in CHANGES or one.log_evidence_gain > winning), None)
+    if best is None or best.reading is Reading.AS_RECORDED:
+        return Explanation(Reading.AS_RECORDED, 0.0)
+    rivals: dict[Reading, Rival] = {}
+    for one in able:
+        if one.reading not in (best.reading, Reading.AS_RECORDED, *rivals):
+            less = best.log_evidence_gain - one.log_evidence_gain
+            excluded = is_claimed(less) or one.log_evidence_gain <= winning
+            rivals[one.reading] = Rival(one.reading, one.log_evidence_gain, excluded)
+    return replace(best, rivals=tuple(rivals.values()))
+
+
+def _only_positions(fit: PoseFit) -> bool:
+    """Tell whether orientations agree as those of a sound arm do, and positions do not."""
+    metres, radians = fit.solved.scales.robot
+    return bool(radians < _SOUND_RAD and metres > _FAR_M and (fit.full > 0.5).mean() > 0.5)
+
+
+def _of_other_base(views: PoseViews, as_recorded: PoseFit | None, seed: int) -> list[Explanation]:
+    """Read the positions in a base that is turned against that of the orientations, by least squares."""
+    if as_recorded is None:
+        return []
+    R, t, C = views.flange[:, :3, :3], views.flange[:, :3, 3], views.boards.C
+    seen = (as_recorded.X[0, :3, :3] @ C[:, :3, 3, None])[..., 0]
+    eye = np.broadcast_to(np.eye(3), R.shape)
+    by_turn = np.einsum("ab,nk->nabk", np.eye(3), t).reshape(len(t), 3, 9)
+    if views.mount == "eye-in-hand":  # R x + R R_X c + Q t = y
+        J, right = np.concatenate([by_turn, R, -eye], axis=2), -(R @ seen[..., None])[..., 0]
+    else:  # R_X c + x = R y + Q t
+        J, right = np.concatenate([by_turn, R, -eye], axis=2), seen
+    Q = np.linalg.lstsq(J.reshape(-1, J.shape[2]), right.ravel(), rcond=None)[0][:9].reshape(3, 3)
+    U, stretch, Vt = np.linalg.svd(Q)
+    if np.linalg.det(Q) <= 0 or stretch.max() > 2 or stretch.min() < 0.5:
+        return []
+    flange = views.flange.copy()
+    flange[:, :3, 3] = t @ (U @ Vt).T
+    fit = _fit(replace(views, flange=flange), seed)
+    if fit is None:
+        return []
+    return [Explanation(Reading.OTHER_BASE, fit.log_evidence - as_recorded.log_evidence)]
+
+
+def _of_other_resolution(views: PoseViews, pictured: ViewSet, base: float, seed: int) -> list[Explanation]:
+    """Read the lens as that of images of another size, of which its principal point is the middle."""
+    camera = pictured.camera
+    if camera.matrix is None or not views.corner_px:
+        return []
+    K = np.array(camera.matrix)
+    across, down = (2 * K[0, 2] + 1) / camera.width, (2 * K[1, 2] + 1) / camera.height
+    near = float(np.sqrt(across * down)) if across > 0 and down > 0 else 1.0
+    scale = min(_SCALES, key=lambda one: abs(np.log(one / near)))
+    if scale == 1.0 or abs(np.log(across / down)) > _MIDDLE or abs(np.log(scale / near)) > _MIDDLE:
+        return []
+    C = pictured.camera_from_board
+    aim = K[:2] @ (C[:, :3, 3] / C[:, 2:3, 3]).T  # pixels of the boards' origins
+    K[:2] /= scale
+    lens = msgspec.structs.replace(camera, matrix=tuple(tuple(row) for row in K.tolist()))
+    start = C.copy()
+    start[:, 2, 3] /= scale
+    start[:, :2, 3] = ((aim.T - K[:2, 2]) / np.diag(K)[:2]) * start[:, 2:3, 3]
+    C = fit_corners(observe_views(pictured), lens, start).C
+    placed = zip(pictured.views, C, strict=True)
+    seen = tuple(replace(view, camera_from_board=pose) for view, pose in placed)
+    again = replace(pictured, camera=lens, views=seen)
+    sigma = views.boards.sigma
+    try:
+        fit = _fit(pose_views(again, float(sigma[_FOCAL]), float(sigma[_SIZE])), seed)
+    except np.linalg.LinAlgError:
+        return []
+    if fit is None:
+        return []
+    size = round(camera.width * scale), round(camera.height * scale)
+    return [Explanation(Reading.OTHER_RESOLUTION, fit.log_evidence - base, factor=1 / scale, size_px=size)]
 
 
 def explain_changes(
@@ -92,9 +203,9 @@ def explain_changes(
     return Explanation(
         likeliest.reading,
         likeliest.log_bayes,
-        likeliest.at,
-        (likeliest.first, likeliest.last),
-        likeliest.factor,
+        at=likeliest.at,
+        between=(likeliest.first, likeliest.last),
+        factor=likeliest.factor,
     )
 
 
@@ -116,7 +227,7 @@ def _readings(views: PoseViews) -> Iterator[tuple[Reading, PoseViews, int, float
         yield reading, replace(views, flange=change(views.flange)), 0, 0.0
     for place, (read, meant) in enumerate(_ORDERS):
         yield Reading.EULER_ORDER, replace(views, flange=_reordered(views.flange, read, meant)), place, 0.0
-    yield Reading.MIRRORED, replace(views, boards=_mirrored(views.boards)), 0, 0.0
+    yield Reading.MIRRORED, _mirrored(views), 0, 0.0
     for shift in (*range(-_LARGEST_SHIFT, 0), *range(1, _LARGEST_SHIFT + 1)):
         if len(views) - abs(shift) >= _FEWEST_PER_PART + 2:
             yield Reading.SHIFTED, _shifted(views, shift), shift, _LOST_VIEW * abs(shift)
@@ -131,11 +242,18 @@ def _let_free(boards: BoardPoses, factor: int) -> BoardPoses:
     return replace(boards, sigma=sigma)
 
 
-def _mirrored(boards: BoardPoses) -> BoardPoses:
+def _mirrored(views: PoseViews) -> PoseViews:
     """Convert to board poses of mirrored images: x of camera and board change their sign."""
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
-    motion = boards.motion * [-1.0, 1.0, 1.0, 1.0, -1.0, -1.0]
-    return replace(boards, C=mirror @ boards.C @ mirror, motion=motion)
+    signs = np.array([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
+    boards = replace(views.boards, C=mirror @ views.boards.C @ mirror, motion=views.boards.motion * signs)
+    return replace(views, boards=boards, covariance=views.covariance * np.outer(signs, signs))
+
+
+def _right_handed(poses: Array) -> Array:
+    """Mirror y of poses (n, 4, 4) in a left-handed frame."""
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    return np.asarray(mirror @ poses @ mirror)
 
 
 def _shifted(views: PoseViews, shift: int) -> PoseViews:
@@ -192,6 +310,7 @@ _CONVENTIONS: dict[Reading, Callable[[Array], Array]] = {
     Reading.ANGLES_AS_ROTATION_VECTOR: _rotations(
         lambda R: Rotation.from_euler("xyz", rotation_log(R)).as_matrix()
     ),
+    Reading.LEFT_HANDED: _right_handed,
     Reading.INVERSE_ROTATIONS: _rotations(lambda R: np.asarray(R.transpose(0, 2, 1))),
 }
 
@@ -211,11 +330,19 @@ _TEXTS = {
     Reading.SHIFTED: "Each image belongs to the robot pose {rows} {later}. "
     "Move the poses by that many rows and import again.",
     Reading.MIRRORED: "The images are mirrored. Switch the camera's flip or reverse x off and record again.",
+    Reading.LEFT_HANDED: "The robot poses are of a left-handed frame (y against that of a robot). "
+    "Mirror them, y, qx and qz with the other sign, and import again.",
+    Reading.OTHER_BASE: "The robot's positions are of another base than its orientations. "
+    "Take both of one frame and import again.",
+    Reading.POSITIONS_DISAGREE: "The robot's orientations agree with the images, its positions do not. "
+    "Check that both are of the same base, of the same point of the tool, and in one unit.",
     Reading.SQUARE_SIZE: "The board's squares are {factor:.4g} times as large as configured. "
     "Measure the board, correct square_m and solve again with --square-mm.",
     Reading.MILLIMETRES: "The {in_mm} are in millimetres. Write them in metres and import again.",
     Reading.FOCAL_LENGTH: "The focal length is {factor:.3f} times the given one. "
     "Solve with --estimate-intrinsics, or calibrate the camera again.",
+    Reading.OTHER_RESOLUTION: "The camera matrix is that of images of {size}, not of these: "
+    "{factor:.4g} times its focal lengths and principal point fit. Give that matrix and solve again.",
     Reading.REFOCUSED: "The camera was refocused or zoomed {where}. Lock the lens and record again.",
     Reading.BOARD_MOVED: _MOVED,
     Reading.CAMERA_MOVED: _MOVED,
@@ -229,16 +356,21 @@ _WHAT_MOVED = {
 
 
 def explain_text(session: Explanation, views: ViewSet) -> str:
-    """Tell in at most two sentences how the recording reads and what to do."""
-    return _TEXTS[session.reading].format(
-        factor=session.factor,
-        order=session.order,
-        rows=abs(session.at),
-        later="later" if session.at > 0 else "earlier",
-        in_mm="robot positions" if session.factor > 1 else "square sizes",
-        moved=_WHAT_MOVED.get((session.reading, views.mount), ""),
-        where=_where(session, views),
-    )
+    """Tell how the recording reads and what to do; where several readings stand, each of them."""
+    texts = [
+        _TEXTS[reading].format(
+            factor=session.factor,
+            order=session.order,
+            rows=abs(session.at),
+            later="later" if session.at > 0 else "earlier",
+            in_mm="robot positions" if session.factor > 1 else "square sizes",
+            moved=_WHAT_MOVED.get((reading, views.mount), ""),
+            where=_where(session, views),
+            size="{} × {}".format(*session.size_px),
+        )
+        for reading in session.readings
+    ]
+    return texts[0] if len(texts) == 1 else "One of these is so. " + " Or: ".join(texts)
 
 
 def _where(session: Explanation, views: ViewSet) -> str:

@@ -56,6 +56,8 @@ class SolveOptions:
     lens_sigma: tuple[float, ...] | None = None
     """1σ of a given lens in the order of `projection.intrinsics_names`; None: the default 0.2 %."""
     board: BoardTolerance = field(default_factory=BoardTolerance)
+    unmirrored: bool = False
+    """The board was found by its markers, which are not found in a mirrored image."""
     working_distance_m: float | None = None
     """Distance along the camera's axis for the predicted error; None: median board distance."""
     holdout: bool = True
@@ -139,21 +141,38 @@ class Reading(Enum):
     EULER_ORDER = "euler-order"
     SHIFTED = "shifted-pictures"
     MIRRORED = "mirrored-pictures"
+    LEFT_HANDED = "left-handed-poses"
+    OTHER_BASE = "positions-in-another-base"
+    POSITIONS_DISAGREE = "positions-disagree"
     SQUARE_SIZE = "square-size"
     MILLIMETRES = "millimetres"
     FOCAL_LENGTH = "focal-length"
+    OTHER_RESOLUTION = "other-resolution"
     BOARD_MOVED = "board-moved"
     CAMERA_MOVED = "camera-moved"
     REFOCUSED = "refocused"
 
 
-@dataclass(frozen=True, eq=False)
-class Explanation:
-    """The reading that explains a recording best, and by how much."""
+@dataclass(frozen=True)
+class Rival:
+    """A reading that another one was held against."""
 
     reading: Reading
     log_evidence_gain: float
     """Gain over the recording as it stands."""
+    excluded: bool
+    """The reading that is named has so much more evidence that this one is not the cause."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The reading that explains a recording best, and by how much; with all that it was held against."""
+
+    reading: Reading
+    log_evidence_gain: float
+    """Gain over the recording as it stands."""
+    rivals: tuple[Rival, ...] = ()
+    """One of each reading, those with the most evidence first. What is not excluded is named, too."""
     at: int = 0
     """Index of the first view after a change; for shifted images, by how many poses."""
     between: tuple[int, int] = (0, 0)
@@ -162,6 +181,13 @@ class Explanation:
     """True over configured size of the squares, or focal length, of the later part where it changed."""
     order: tuple[str, str] = ("", "")
     """Orders of angles, as scipy writes them: by which they were read, by which they should have been."""
+    size_px: tuple[int, int] = (0, 0)
+    """Width and height of the images that the told lens belongs to, where it is not these."""
+
+    @property
+    def readings(self) -> tuple[Reading, ...]:
+        """The reading, and those that the evidence does not exclude beside it."""
+        return (self.reading, *(rival.reading for rival in self.rivals if not rival.excluded))
 
 
 @dataclass(frozen=True, eq=False)

@@ -114,16 +114,26 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     try:
         fit = fit_cell(views, priors, options.seed)
     except PosesDisagreeError as problem:
-        session = explain_recording(poses, options.seed)
+        session = explain_recording(
+            poses, options.seed, unmirrored=options.unmirrored, pictured=_with_told_lens(views, options)
+        )
         raise PosesDisagreeError(
             hypothesis=session.reading.value, **problem.values | {"advice": explain_text(session, views)}
         ) from None
     solution = _describe(fit, options)
     by_links = None if fit.arm is None else fit.arm.chain.by_links(fit.arm.joints_rad)
     disagree = float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH
-    explain = explain_recording if disagree or _doubtful(solution) else explain_changes
-    session = explain(poses, options.seed, by_links)
+    if disagree or _doubtful(solution):
+        pictured = _with_told_lens(fit.views, options)
+        session = explain_recording(poses, options.seed, by_links, options.unmirrored, pictured)
+    else:
+        session = explain_changes(poses, options.seed, by_links)
     return replace(solution, session=session, warnings=_remarks(fit, solution, session))
+
+
+def _with_told_lens(views: ViewSet, options: SolveOptions) -> ViewSet | None:
+    """Return the views where their lens was told; None where it was found from the same images."""
+    return None if options.intrinsics_from_same_pictures else views
 
 
 def _priors(views: ViewSet, options: SolveOptions) -> Priors:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.boards.model import has_markers
 from calibrate.geometry import Array, inverse, rotation_angle, rotation_log
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.board_motion import BoardMotion, board_extent_m, boards_own_motion
@@ -26,7 +27,7 @@ from calibrate.handeye.pose_fit import (
     pose_views,
 )
 from calibrate.handeye.readings import clear_gain, explain_recording, explain_text
-from calibrate.handeye.solution import Reading
+from calibrate.handeye.solution import Explanation, Reading
 from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates, with_poses
 from calibrate.views import ViewSet
@@ -340,7 +341,7 @@ _CHECK_PAIRS = (
 
 def _nearest(readings: list[TableReading]) -> dict[str, Any]:
     """The reading nearest to right, and what would make it right, as a solve names it."""
-    explained = [explain_recording(_pose_views(reading.views, reading.seen)) for reading in readings]
+    explained = [_explained(reading) for reading in readings]
     gains = [found.log_evidence_gain if found.reading in _CAUSES else 0.0 for found in explained]
     evidence = [reading.log_evidence + gain for reading, gain in zip(readings, gains, strict=True)]
     best, found = readings[at := int(np.argmax(evidence))], explained[at]
@@ -357,7 +358,24 @@ def _nearest(readings: list[TableReading]) -> dict[str, Any]:
     return {**near, "cause": cause, "text": text}
 
 
-_CAUSES = (Reading.SHIFTED, Reading.MIRRORED, Reading.BOARD_MOVED, Reading.CAMERA_MOVED)
+def _explained(reading: TableReading) -> Explanation:
+    seen = reading.seen
+    pictured = reading.views if seen.camera_known and seen.convention is None else None
+    return explain_recording(
+        _pose_views(reading.views, seen), unmirrored=has_markers(seen.board), pictured=pictured
+    )
+
+
+_CAUSES = (
+    Reading.SHIFTED,
+    Reading.MIRRORED,
+    Reading.LEFT_HANDED,
+    Reading.OTHER_BASE,
+    Reading.POSITIONS_DISAGREE,
+    Reading.OTHER_RESOLUTION,
+    Reading.BOARD_MOVED,
+    Reading.CAMERA_MOVED,
+)
 """What no convention of numbers mends."""
 
 

@@ -56,6 +56,10 @@ _MOST_PLACES = 120
 """Most places, evenly spread, that are looked at by medians."""
 _MOST_FITS = 3
 """Most fits of one change, each at the place that the one before found better."""
+_OWN_ROUNDS = 12
+"""Rounds in which each error of the arm gets a size of its own."""
+_LEAST_OWN = 1e-3
+"""Least of these sizes, mm and mrad."""
 _AGREES = 0.5
 """Probability of ordinary noise from which a view agrees."""
 _ROUNDS = 4
@@ -174,6 +178,7 @@ class ChangeSearch:
         self._seed = seed
         self._fit = as_recorded
         state = _State(as_recorded.X[0], as_recorded.Y[0], as_recorded.factors)
+        self._factors = state.factors
         self._linear = self._linearised(state)
         self._priors = [self._prior(state.factors, size) for size in _SIZES]
         scales = as_recorded.solved.scales
@@ -298,12 +303,32 @@ class ChangeSearch:
         return _Weighed(places, by_place, likeliest.scales, sides.apart, bool(agrees))
 
     def _log_none(self, scales: Scales) -> float:
-        """Log evidence of no change, the sizes averaged, from the noise without and with a change."""
+        """Log evidence of no change, from the noise without and with a change: the sizes averaged, or a size
+        of its own for each error of the arm, whichever is more."""
         again = [self._linear.solve(prior, scales, "robot", _ROUNDS) for prior in self._priors]
         logs = [
             max(one.log_evidence, other.log_evidence) for one, other in zip(self._none, again, strict=True)
         ]
-        return float(special.logsumexp(logs) - np.log(len(logs)))
+        averaged = float(special.logsumexp(logs) - np.log(len(logs)))
+        likeliest = max([*self._none, *again], key=lambda one: one.log_evidence)
+        return max(averaged, self._by_own_sizes(likeliest))
+
+    def _by_own_sizes(self, solved: LinearSolution) -> float:
+        """Log evidence of no change where each error of the arm, by threes, is as large as the views say.
+
+        Sizes by evidence: M. Tipping (2001). A change gets no such sizes, so this can only doubt it.
+        """
+        best = solved.log_evidence
+        at = len(solved.step) - self._errors.shape[2]
+        for _ in range(_OWN_ROUNDS):
+            square = solved.step**2 + np.diag(np.linalg.inv(solved.precision))
+            variance = square[at:].reshape(-1, 3).mean(axis=1)
+            sigma = np.repeat(np.sqrt(np.maximum(variance, (_LEAST_OWN * ARM_ERROR_UNIT) ** 2)), 3)
+            base = pose_prior(self._views.boards, 2, self._factors)
+            prior = _wider(base, sigma**-2.0, -float(np.log(sigma).sum()))
+            solved = self._linear.solve(prior, solved.scales, "robot", _ROUNDS)
+            best = max(best, solved.log_evidence)
+        return best
 
     @property
     def _places(self) -> NDArray[np.intp]:

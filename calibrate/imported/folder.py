@@ -247,6 +247,11 @@ def _no_pairs(held: Contents, robots: list[Table]) -> ImportSourceError:
         return AmbiguousSourceError(
             "which-poses", source=held.root, sets=names, option="--poses", choices=choices
         )
+    beside: list[list[Path] | Table] = list(held.images.values())
+    beside += [table for table in held.tables if table not in robots]
+    pairs = max((len(_pairs(robot, other)) for robot in robots for other in beside), default=0)
+    if 0 < pairs < FEWEST:
+        return ImportSourceError("too-few-pairs", source=held.root, pairs=pairs, needed=FEWEST)
     return ImportSourceError("no-pairs", source=held.root, **said)
 
 
@@ -437,7 +442,7 @@ def _rows(
         boards = pose(OPTICAL_FROM_AXES[axes], np.zeros(3)) @ boards
     return [
         PoseRow(
-            n + 1,
+            0,
             f"row {key + 1}" if isinstance(key, int) else str(key.relative_to(held.root)),
             _matrix(flanges[n]),
             None if joints is None else tuple(joints_rad(joints)[pairs[key]].tolist()),

@@ -95,9 +95,10 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
 @dataclass(frozen=True)
 class PoseRow:
-    """One line of poses.csv."""
+    """One line of poses.csv, or a row of what anyone's folder is believed to say."""
 
     line: int
+    """0: of no poses.csv."""
     image: str
     """Relative to the folder, as written."""
     base_from_flange: Matrix4

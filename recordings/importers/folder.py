@@ -78,11 +78,15 @@ def _write(
     newest_ns: int,
     progress: Progress,
 ) -> Imported:
-    if output is None:
-        return Imported(folder, len(rows))
     camera = dataset.camera
     assert camera is not None
     size = (camera.width, camera.height)
+    if output is None:
+        for index, row in enumerate(rows):
+            if row.camera_from_board is None:
+                read_image(folder, row, size)  # a damaged image has a sound header
+            progress(index + 1, len(rows), "checking")
+        return Imported(folder, len(rows))
     with derived_recording(output, dataset.session(folder, camera, newest_ns)) as writer:
         for name, content in beside.items():
             writer.attach(name, _MEDIA[Path(name).suffix], content)

@@ -40,7 +40,7 @@ def read_checked(
 ) -> tuple[str, bytes]:
     """(format, at most so many bytes) of an image inside the folder, of this size by its header."""
     path = folder / image
-    place: dict[str, Any] = {"path": folder / POSES_FILE, "line": line, "image": image}
+    place: dict[str, Any] = {"place": _place(folder, line), "line": line, "image": image}
     try:
         if path.exists() and not path.is_file():  # a pipe would never be read to its end
             raise ImportSourceError("unreadable", **place, reason="not a file")
@@ -54,12 +54,18 @@ def read_checked(
     except ImageError as error:
         raise bad_image(folder, line, image, error) from error
     if (header.width, header.height) != size:
-        named = f"{folder / POSES_FILE} line {line}: {image}"
+        named = f"{_place(folder, line)}: {image}"
         raise wrong_size_error(named, (header.width, header.height), size, line)
     return header.format, data
 
 
 def bad_image(folder: Path, line: int, image: str, error: ImageError) -> ImportSourceError:
-    """What is wrong with the image of a line."""
-    place = f"{folder / POSES_FILE} line {line}"
-    return ImportSourceError("bad-image", place=place, image=image, reason=str(error), line=line)
+    """What is wrong with an image; line 0: no poses.csv lists it."""
+    return ImportSourceError(
+        "bad-image", place=_place(folder, line), image=image, reason=str(error), line=line
+    )
+
+
+def _place(folder: Path, line: int) -> str:
+    """Where an image is listed: the line of poses.csv, or only the folder."""
+    return f"{folder / POSES_FILE} line {line}" if line else str(folder)

@@ -1,5 +1,6 @@
 """A recording that has to be read in another way is recognised, and a sound one is taken as it is."""
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -87,6 +88,25 @@ def in_millimetres(c):
     return with_flange(c.views, flange)
 
 
+def left_handed(c):
+    """Robot poses in a frame whose y points the other way."""
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    return with_flange(c.views, mirror @ c.views.base_from_flange @ mirror)
+
+
+def of_another_base(c):
+    """The positions in a base that is turned by a quarter against that of the orientations."""
+    flange = c.views.base_from_flange
+    flange[:, :3, 3] = flange[:, :3, 3] @ rotation_exp([0.0, 0.0, np.pi / 2]).T
+    return with_flange(c.views, flange)
+
+
+def with_matrix_of_twice_the_size(c):
+    (fx, skew, cx), (_, fy, cy), last = c.camera.matrix
+    doubled = ((2 * fx, 2 * skew, 2 * cx + 0.5), (0.0, 2 * fy, 2 * cy + 0.5), last)
+    return seen_through(c.views, msgspec.structs.replace(c.camera, matrix=doubled))
+
+
 MISREAD = {
     Reading.INVERSE_POSES: lambda c: with_flange(c.views, inverse(c.views.base_from_flange)),
     Reading.QUATERNION_ORDER: rotations(
@@ -100,7 +120,7 @@ MISREAD = {
     ),
     Reading.INVERSE_ROTATIONS: rotations(lambda R: R.transpose(0, 2, 1)),
     Reading.SHIFTED: lambda c: with_flange(c.views, np.roll(c.views.base_from_flange, 1, axis=0)),
-    Reading.MIRRORED: mirrored,
+    Reading.OTHER_BASE: of_another_base,
     Reading.MILLIMETRES: in_millimetres,
     Reading.SQUARE_SIZE: of_other_size,
     Reading.FOCAL_LENGTH: lambda c: seen_through(c.views, with_focal(c.camera, 1.05)),
@@ -197,6 +217,37 @@ def test_a_board_given_in_millimetres_is_told_from_robot_poses_that_are():
     found = explained(seen_through(views, c.camera))
     assert found.reading is Reading.MILLIMETRES
     assert found.factor == pytest.approx(1e-3, rel=0.1)
+
+
+@MOUNTS
+@pytest.mark.parametrize("how", [mirrored, left_handed])
+def test_what_is_mirrored_is_told_by_markers_only(mount, how):
+    """Of a chessboard either side may be mirrored: both are named. No mirrored marker is ever found."""
+    poses = pose_views(how(cell(mount)), 0.002, 0.003)
+    assert set(explain_recording(poses).readings) == {Reading.MIRRORED, Reading.LEFT_HANDED}
+    assert explain_recording(poses, unmirrored=True).readings == (Reading.LEFT_HANDED,)
+
+
+@MOUNTS
+def test_a_matrix_of_another_resolution_is_told_from_a_wrong_focal_length(mount):
+    c = cell(mount)
+    views = with_matrix_of_twice_the_size(c)
+    found = explain_recording(pose_views(views, 0.002, 0.003), pictured=views)
+    assert found.reading is Reading.OTHER_RESOLUTION
+    assert found.factor == 0.5 and found.size_px == (2 * c.camera.width, 2 * c.camera.height)
+    other = seen_through(c.views, with_focal(c.camera, 1.05))
+    assert explain_recording(pose_views(other, 0.002, 0.003), pictured=other).readings == (
+        Reading.FOCAL_LENGTH,
+    )
+
+
+def test_orientations_that_agree_with_positions_that_do_not_are_told():
+    c = cell("eye-in-hand")
+    flange = c.views.base_from_flange
+    flange[:, :3, 3] += 0.1 * np.random.default_rng(0).normal(size=(len(flange), 3))
+    with pytest.raises(PosesDisagreeError) as refused:
+        solve_views(with_flange(c.views, flange))
+    assert refused.value.values["hypothesis"] == Reading.POSITIONS_DISAGREE.value
 
 
 @MOUNTS

@@ -1,0 +1,61 @@
+"""What moved half-way is named with its place; an arm whose errors follow its posture moves nothing."""
+
+import numpy as np
+import pytest
+
+from benchmarks.moved import MOUNTS, measure, moved_cell
+from calibrate.geometry import perturb
+from calibrate.handeye.pose_fit import pose_views
+from calibrate.handeye.readings import explain_changes, explain_recording, explain_text
+from calibrate.handeye.solution import Reading
+from tests.calibrate.cells import MID, make_cell, slipped, with_flange
+
+SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])
+
+
+def changes(views):
+    return explain_changes(pose_views(views, 0.002, 0.003))
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("order", ["random", "swept", "halves"])
+def test_an_arm_with_errors_of_its_own_moves_no_board(mount, order):
+    for seed in range(2):
+        rng = np.random.default_rng([seed, len(mount), len(order)])
+        views = moved_cell(rng, "nothing", 0.0, order, False, mount, 12, seed)
+        assert changes(views).reading is Reading.AS_RECORDED
+
+
+@pytest.mark.parametrize(("what", "mount"), [("board", "eye-in-hand"), ("camera", "eye-to-hand")])
+def test_a_millimetre_half_way_is_found_in_a_solve_that_nothing_else_disturbs(what, mount):
+    trial = measure((what, 1.0, "random", False, mount, 0))
+    assert trial.named and trial.truly and trial.held
+
+
+def test_the_range_of_the_first_changed_view_is_told_as_values_and_in_words():
+    rng = np.random.default_rng([8, 0])
+    views, _, _ = slipped(make_cell(rng, 24, MID), "board", 12, SLIP, MID, rng)
+    found = changes(views)
+    first, last = found.between
+    assert found.reading is Reading.BOARD_MOVED and first <= 12 <= last and first <= found.at <= last
+    assert views.views[found.at].name in explain_text(found, views)
+
+
+def test_one_wrong_view_at_the_end_is_a_wrong_view():
+    cell = make_cell(np.random.default_rng(3), 20, MID)
+    flange = cell.views.base_from_flange
+    flange[-1] = perturb(flange[-1], SLIP)
+    views = with_flange(cell.views, flange)
+    assert changes(views).reading is Reading.AS_RECORDED
+
+
+def test_a_cause_carries_the_rivals_that_it_was_held_against():
+    rng = np.random.default_rng([8, 1])
+    views, _, _ = slipped(make_cell(rng, 20, MID), "camera", 10, SLIP, MID, rng)
+    found = explain_recording(pose_views(views, 0.002, 0.003))
+    assert found.readings == (Reading.CAMERA_MOVED,)
+    held = {rival.reading: rival for rival in found.rivals}
+    assert {Reading.MIRRORED, Reading.SQUARE_SIZE, Reading.INVERSE_POSES} <= held.keys()
+    assert all(rival.excluded for rival in held.values())
+    gains = [rival.log_evidence_gain for rival in found.rivals]
+    assert gains == sorted(gains, reverse=True) and gains[0] < found.log_evidence_gain

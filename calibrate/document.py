@@ -132,6 +132,17 @@ def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> 
     )
 
 
+def _session(solution: Solution) -> SessionReading:
+    session = solution.session
+    code = session.reading.value
+    text = next((remark.text for remark in solution.warnings if remark.code == code), "")
+    others = [reading.value for reading in session.readings[1:]]
+    if session.numbers is None:
+        return SessionReading(code, text, others)
+    changed_from, first, last = session.numbers
+    return SessionReading(code, text, others, changed_from, (first, last))
+
+
 def _quality(
     solution: Solution,
     gates: tuple[Gate, ...],
@@ -140,7 +151,6 @@ def _quality(
 ) -> Quality:
     noise = solution.noise
     remarks = _remarks(solution, loaded, intrinsics)
-    reading = solution.session.reading.value
     return Quality(
         gates=list(gates),
         certificate=solution.certificate,
@@ -162,7 +172,7 @@ def _quality(
         weakest=solution.observability.weakest_text,
         board=solution.board,
         cross_validation=solution.cross_validation,
-        session=SessionReading(reading, next((r.text for r in solution.warnings if r.code == reading), "")),
+        session=_session(solution),
         arm=None if solution.arm is None else solution.arm.stated,
         warnings=[remark.text for remark in remarks],
         warning_codes=[remark.code for remark in remarks],

@@ -104,11 +104,17 @@ class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
     robot_deg: float | None = None
 
 
-class SessionReading(msgspec.Struct, frozen=True):
+class SessionReading(msgspec.Struct, frozen=True, omit_defaults=True):
     """Interpretation that explains the recording best: as recorded, or for instance with inverted poses."""
 
     hypothesis: str
     text: str
+    others: list[str] = []
+    """Readings that the evidence does not exclude beside it."""
+    changed_from: int | None = None
+    """Index of the first view after a change of camera, board or focus."""
+    changed_between: tuple[int, int] | None = None
+    """Indices of views between which that is, with a probability of 95 %."""
 
 
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):

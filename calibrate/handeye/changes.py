@@ -56,10 +56,6 @@ _MOST_PLACES = 120
 """Most places, evenly spread, that are looked at by medians."""
 _MOST_FITS = 3
 """Most fits of one change, each at the place that the one before found better."""
-_OWN_ROUNDS = 12
-"""Rounds in which each error of the arm gets a size of its own."""
-_LEAST_OWN = 1e-3
-"""Least of these sizes, mm and mrad."""
 _AGREES = 0.5
 """Probability of ordinary noise from which a view agrees."""
 _ROUNDS = 4
@@ -95,13 +91,7 @@ def errors_by_posture(flange: Array, by_links: Array | None = None) -> Array:
     in the order of the views. A bracket bends. Where the arm's kinematics are known, so are the errors by its
     links (n, 6, p).
     """
-    middle = np.median(flange[:, :3, 3], axis=0)
-    away = np.linalg.norm(flange[:, :3, 3] - middle, axis=1)
-    near = away <= 5 * max(float(np.median(away)), 1e-9)  # a pose that is told metres away sets no range
-    place = (flange[:, :3, 3] - middle) / max(float(np.sqrt((away[near] ** 2).mean())), 1e-9)
-    turned = (flange[:, :3, :3] - flange[near, :3, :3].mean(axis=0)).reshape(len(flange), 9)
-    posture = np.concatenate([place, turned], axis=1)
-    posture[~near] = 0.0
+    posture, near = _posture(flange)
     square = ((posture[:, None] - posture) ** 2).sum(axis=2)
     length = max(float(np.median(square[np.triu_indices(len(square), 1)])), 1e-9)
     values, vectors = np.linalg.eigh(np.exp(-0.5 * square / length))
@@ -113,6 +103,18 @@ def errors_by_posture(flange: Array, by_links: Array | None = None) -> Array:
     by_posture = np.einsum("nk,ab->nakb", terms, np.eye(6)).reshape(len(flange), 6, -1)
     parts = [by_posture, flex_motion(flange)] + ([] if by_links is None else [by_links])
     return np.concatenate(parts, axis=2)
+
+
+def _posture(flange: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return position and rotation (n, 12) of the flange, and which views (n,) are not told far away."""
+    middle = np.median(flange[:, :3, 3], axis=0)
+    away = np.linalg.norm(flange[:, :3, 3] - middle, axis=1)
+    near = away <= 5 * max(float(np.median(away)), 1e-9)  # a pose that is told metres away sets no range
+    place = (flange[:, :3, 3] - middle) / max(float(np.sqrt((away[near] ** 2).mean())), 1e-9)
+    turned = (flange[:, :3, :3] - flange[near, :3, :3].mean(axis=0)).reshape(len(flange), 9)
+    posture = np.concatenate([place, turned], axis=1)
+    posture[~near] = 0.0
+    return posture, near
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +180,7 @@ class ChangeSearch:
         self._seed = seed
         self._fit = as_recorded
         state = _State(as_recorded.X[0], as_recorded.Y[0], as_recorded.factors)
-        self._factors = state.factors
+        self._posture = _posture(views.flange)[0]
         self._linear = self._linearised(state)
         self._priors = [self._prior(state.factors, size) for size in _SIZES]
         scales = as_recorded.solved.scales
@@ -275,7 +277,9 @@ class ChangeSearch:
         chance = np.exp(weighed.logs - special.logsumexp(weighed.logs))
         first, last = _held(chance, int(weighed.logs.argmax()))
         prior = np.log(len(self._places) * kinds)
-        log_bayes = float(special.logsumexp(weighed.logs) - prior) - self._log_none(weighed.scales)
+        by_posture = self._log_by_posture(kind, weighed.best, weighed.scales) - prior
+        none = max(self._log_none(weighed.scales), by_posture)
+        log_bayes = float(special.logsumexp(weighed.logs) - prior - none)
         places = weighed.places
         factor = 1.0 + float(weighed.apart[0]) if kind is Reading.REFOCUSED else 1.0
         return Change(kind, log_bayes, weighed.best, int(places[first]), int(places[last]), factor)
@@ -294,41 +298,37 @@ class ChangeSearch:
         places = self._places[np.abs(self._places - at) <= _NEAREST]
         beside = [sides.split(int(place)).solve(prior, likeliest.scales, "nothing") for place in places]
         by_place = np.array([_log_of_change(one, sides.apart) for one in beside])
-        # Where the sides were fitted the sizes of the arm's errors are averaged; elsewhere they differ by as
-        # much as for the likeliest size.
+        # Where the sides were fitted, the sizes of the arm's errors are averaged; elsewhere the evidence
+        # differs by as much as for the likeliest size.
         here = by_place[int(np.flatnonzero(places == at)[0])]
-        by_place += special.logsumexp(logs) - np.log(len(logs)) - here
+        averaged = float(special.logsumexp(logs) - np.log(len(logs)))
+        by_place += averaged - here
         ordinary = likeliest.chances[:, 0] > _AGREES
         agrees = min(ordinary[:at].sum(), ordinary[at:].sum()) >= FEWEST_PER_PART
         return _Weighed(places, by_place, likeliest.scales, sides.apart, bool(agrees))
 
     def _log_none(self, scales: Scales) -> float:
-        """Log evidence of no change, from the noise without and with a change: the sizes averaged, or a size
-        of its own for each error of the arm, whichever is more."""
+        """Log evidence of no change, the sizes averaged, from the noise without and with a change."""
         again = [self._linear.solve(prior, scales, "robot", _ROUNDS) for prior in self._priors]
         logs = [
             max(one.log_evidence, other.log_evidence) for one, other in zip(self._none, again, strict=True)
         ]
-        averaged = float(special.logsumexp(logs) - np.log(len(logs)))
-        likeliest = max([*self._none, *again], key=lambda one: one.log_evidence)
-        return max(averaged, self._by_own_sizes(likeliest))
+        return float(special.logsumexp(logs) - np.log(len(logs)))
 
-    def _by_own_sizes(self, solved: LinearSolution) -> float:
-        """Log evidence of no change where each error of the arm, by threes, is as large as the views say.
+    def _log_by_posture(self, kind: Reading, at: int, scales: Scales) -> float:
+        """Log evidence of an error like the change before view `at`, as far as the posture foretells it.
 
-        Sizes by evidence: M. Tipping (2001). A change gets no such sizes, so this can only doubt it.
+        Where postures before and after differ, nobody can tell a change from an arm that errs by posture.
         """
-        best = solved.log_evidence
-        at = len(solved.step) - self._errors.shape[2]
-        for _ in range(_OWN_ROUNDS):
-            square = solved.step**2 + np.diag(np.linalg.inv(solved.precision))
-            variance = square[at:].reshape(-1, 3).mean(axis=1)
-            sigma = np.repeat(np.sqrt(np.maximum(variance, (_LEAST_OWN * ARM_ERROR_UNIT) ** 2)), 3)
-            base = pose_prior(self._views.boards, 2, self._factors)
-            prior = _wider(base, sigma**-2.0, -float(np.log(sigma).sum()))
-            solved = self._linear.solve(prior, solved.scales, "robot", _ROUNDS)
-            best = max(best, solved.log_evidence)
-        return best
+        terms = np.column_stack([np.ones(len(self._views)), self._posture])
+        later = (np.arange(len(self._views)) >= at).astype(float)
+        foretold = terms @ np.linalg.lstsq(terms, later, rcond=None)[0]
+        change = foretold[:, None, None] * self._linear.J[..., self._columns(kind)]
+        linear = replace(self._linear, J=np.concatenate([self._linear.J, change], axis=2))
+        d = change.shape[2]
+        solved = [linear.solve(_with_change(prior, d), scales, "robot", _ROUNDS) for prior in self._priors]
+        logs = [_log_of_change(one, np.zeros(d)) for one in solved]
+        return float(special.logsumexp(logs) - np.log(len(logs)))
 
     @property
     def _places(self) -> NDArray[np.intp]:

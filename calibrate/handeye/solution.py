@@ -181,6 +181,8 @@ class Explanation:
     """True over configured size of the squares, or focal length, of the later part where it changed."""
     order: tuple[str, str] = ("", "")
     """Orders of angles, as scipy writes them: by which they were read, by which they should have been."""
+    numbers: tuple[int, int, int] | None = None
+    """Pose numbers of `at` and `between`, from 0; None where nothing changed between two views."""
     size_px: tuple[int, int] = (0, 0)
     """Width and height of the images that the told lens belongs to, where it is not these."""
 

@@ -64,7 +64,7 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.posterior import posterior_of
 from calibrate.handeye.priors import LensPrior, Priors
-from calibrate.handeye.readings import explain_changes, explain_recording, explain_text
+from calibrate.handeye.readings import CHANGES, explain_changes, explain_recording, explain_text
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.handeye.solution import (
     ArmErrors,
@@ -128,6 +128,9 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         session = explain_recording(poses, options.seed, by_links, options.unmirrored, pictured)
     else:
         session = explain_changes(poses, options.seed, by_links)
+    if session.reading in CHANGES:
+        at, first, last = (fit.views.views[place].index for place in (session.at, *session.between))
+        session = replace(session, numbers=(at, first, last))
     return replace(solution, session=session, warnings=_remarks(fit, solution, session))
 
 

@@ -249,7 +249,7 @@ def _no_pairs(held: Contents, robots: list[Table]) -> ImportSourceError:
         )
     beside: list[list[Path] | Table] = list(held.images.values())
     beside += [table for table in held.tables if table not in robots]
-    pairs = max((len(_pairs(robot, other)) for robot in robots for other in beside), default=0)
+    pairs = max((len(pairs_of(robot, other)) for robot in robots for other in beside), default=0)
     if 0 < pairs < FEWEST:
         return ImportSourceError("too-few-pairs", source=held.root, pairs=pairs, needed=FEWEST)
     return ImportSourceError("no-pairs", source=held.root, **said)

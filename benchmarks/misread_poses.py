@@ -52,6 +52,8 @@ def _flipped(T: Array) -> Array:
 
 _NO_CAUSE = "no-reading mirrored-pictures"
 """Refused; a mirror image of the poses is also one of the images."""
+_A_SIGN = f"{_NO_CAUSE} positions-disagree"
+"""The orientations are those of a camera turned by half a turn; the positions agree with nothing."""
 MISREAD = {
     "angles of another order": Misread("euler-ZYX-deg-mm", "xarm-rpy", "other-convention"),
     "quaternions of another order": Misread("wxyz", "xyzw", "other-convention"),
@@ -62,7 +64,7 @@ MISREAD = {
         "rotvec", None, "shifted-pictures", lambda T: np.roll(T, 1, axis=0)
     ),
     "poses in reverse order": Misread("rotvec", None, _NO_CAUSE, lambda T: T[::-1]),
-    "a sign": Misread("euler-xyz-deg", None, _NO_CAUSE, _flipped),
+    "a sign": Misread("euler-xyz-deg", None, _A_SIGN, _flipped),
 }
 
 

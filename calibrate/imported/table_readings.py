@@ -300,10 +300,12 @@ def decide(
     if not mine or beaten or not is_good(mine[0]):
         nearest = _nearest([*dict.fromkeys(ranked[:_EXPLAINED] + mine[:_EXPLAINED])])
         as_told = named and mount and mine and mine[0].seen.square_known
-        leading = _leading(mine[0], readings) if mine and not beaten and not nearest["cause"] else None
+        # That positions disagree says that something is wrong, not how to read it: outliers do the same.
+        read_otherwise = nearest["cause"] not in ("", Reading.POSITIONS_DISAGREE.value)
+        leading = _leading(mine[0], readings) if mine and not beaten and not read_otherwise else None
         if leading is not None:
             return leading
-        if beaten or not as_told or nearest["cause"]:
+        if beaten or not as_told or read_otherwise:
             raise ImportSourceError("no-reading", source=held.root, **nearest)
     best = mine[0]
     for other in mine[1:]:

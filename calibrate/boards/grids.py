@@ -284,7 +284,8 @@ def true_centres(grey: Grey, ellipses: Array, spec: BoardSpec) -> Array:
         seen = c @ H.T
         bend = centres - seen[:, :2] / seen[:, 2:]
         spots = _spots(grey, H, bend, spec)
-        radius, middles = spots.radius, _middles(spots, H, bend, spec)
+        radius = spots.radius
+        middles = _middles(spots, H, bend, spec)
         shown = seen * seen[:, 2:] - radius**2 * (H[:, :2] @ H[2, :2])
         centres = ellipses - (shown[:, :2] / shown[:, 2:] - seen[:, :2] / seen[:, 2:])
         guessed = np.linalg.norm(centres - middles, axis=1) > _GUESSED_PX
@@ -330,9 +331,10 @@ def _spots(grey: Grey, H: Array, bend: Array, spec: BoardSpec) -> Spots:
 def _middles(spots: Spots, H: Array, bend: Array, spec: BoardSpec) -> Array:
     """Find the middle of each spot's ink (n, 2) px."""
     centres = board_points(spec)[:, :2] / spec.square_m
-    u, v, share = spots.u, spots.v, spots.share
-    area = np.maximum(share.sum(axis=(1, 2)), 1e-9)
-    offset = np.stack([(share * u).sum(axis=(1, 2)), (share * v).sum(axis=(1, 2))], axis=-1) / area[:, None]
+    area = np.maximum(spots.share.sum(axis=(1, 2)), 1e-9)
+    along_u = (spots.share * spots.u).sum(axis=(1, 2))
+    along_v = (spots.share * spots.v).sum(axis=(1, 2))
+    offset = np.stack([along_u, along_v], axis=-1) / area[:, None]
     return through(H, centres + offset) + bend
 
 

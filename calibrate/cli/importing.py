@@ -197,7 +197,8 @@ def _asked(problem: SeveralReadingsError, console: Console) -> StandingReading:
 
 def _as_readings(several: AmbiguousSourceError) -> SeveralReadingsError:
     """The same question in the words of the other."""
-    sets, choices = several.values["sets"], several.values["choices"]
+    sets = several.values["sets"]
+    choices = several.values["choices"]
     assert isinstance(sets, list)
     assert isinstance(choices, list)
     option = str(several.values["option"]).removeprefix("--")

@@ -71,7 +71,8 @@ def board_extent_m(views: ViewSet) -> float:
 
 def _nearness(poses: Array, boards: Array, extent_m: float, axes: Array) -> BoardMotion | None:
     """Compare poses to axes @ lens @ boards @ corner, `lens` a scale across and one along the axis."""
-    R, t = boards[:, :3, :3], boards[:, :3, 3]
+    R = boards[:, :3, :3]
+    t = boards[:, :3, 3]
     turns = np.swapaxes(R, 1, 2) @ axes.T @ poses[:, :3, :3]
     corner = project_to_rotation(np.median(turns, axis=0))
     away_rad = float(np.median(rotation_angle(np.swapaxes(turns, 1, 2) @ corner)))

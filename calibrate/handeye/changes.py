@@ -210,8 +210,10 @@ class ChangeSearch:
         """
         n, column = len(self._views), self._columns(kind)
         places = self._places
-        J, Z = self._linear.J, self._linear.J[..., column]
-        best_at, best = 0, 0.0
+        J = self._linear.J
+        Z = J[..., column]
+        best_at = 0
+        best = 0.0
         for solved in self._none:
             WZ = solved.W @ Z
             shared = _later(np.swapaxes(J, 1, 2) @ WZ)[places]
@@ -226,7 +228,8 @@ class ChangeSearch:
             log += _by_sizes(step, covariance) + 0.5 * np.linalg.slogdet(covariance)[1]
             log -= special.logsumexp([one.log_evidence for one in self._none]) + np.log(len(places) * kinds)
             if log.max() > best:
-                best_at, best = int(places[log.argmax()]), float(log.max())
+                best_at = int(places[log.argmax()])
+                best = float(log.max())
         return [best_at] if best_at else []
 
     def _apart(self, kind: Reading) -> list[int]:
@@ -249,7 +252,8 @@ class ChangeSearch:
         scales = fit.solved.scales
         S, S_inverse = linear.noise(scales)
         alone = class_chances(linear.m, S, S_inverse, scales.shares)[1]
-        best_at, best = 0, 0.0
+        best_at = 0
+        best = 0.0
         places = self._places
         for at in places[:: 1 + len(places) // _MOST_PLACES]:
             for some in (slice(at, n), slice(0, at)):
@@ -258,7 +262,8 @@ class ChangeSearch:
                 log = class_chances(moved, S[some], S_inverse[some], scales.shares)[1]
                 gain = float(log.sum() - alone[some].sum())
                 if gain > best:
-                    best_at, best = int(at), gain
+                    best_at = int(at)
+                    best = gain
         return [best_at] if best_at else []
 
     def _weighed(self, kind: Reading, at: int, kinds: int) -> Change | None:

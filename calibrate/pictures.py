@@ -58,7 +58,7 @@ def read_folder(
     What is not given is found: board and mount by dataset.yaml, images or names, the convention of the
     numbers and the square by the board's motion. poses: their file or folder, where others may be meant.
     images: those of one camera or session: their folder, or their name with # for digits. Where several sets
-    fit and none is named, AmbiguousSourceError holds the choices.
+    fit and none is named, SeveralReadingsError holds the choices.
     Raises RecordingError, which names what decides.
     """
     folder = Path(folder)

@@ -184,13 +184,6 @@ class ImportSourceError(RecordingError):
     code = "import-source"
 
 
-class AmbiguousSourceError(ImportSourceError):
-    """Several things may be meant: values `sets`, and `choices`, which are what `option` takes for each."""
-
-    code = "several-sets"
-    exit_code = 2
-
-
 @dataclass(frozen=True)
 class StandingReading:
     """One of several ways to read data that nothing excludes."""
@@ -209,6 +202,11 @@ class StandingReading:
         return " ".join(named)
 
     @property
+    def translation_text(self) -> str:
+        """The translation in mm, as '45.0, -30.0, 65.0'; empty: X does not differ."""
+        return ", ".join(f"{part:.1f}" for part in self.translation_mm or ())
+
+    @property
     def line(self) -> str:
         """All of it in a line."""
         if self.translation_mm is None:
@@ -220,8 +218,9 @@ class StandingReading:
 class SeveralReadingsError(ImportSourceError):
     """More than one way to read the data stands: a person is asked, nothing is guessed.
 
-    Values: `count`, and of each reading N, from 1, `reading_N`, `options_N` and, where X differs,
-    `translation_N_mm`.
+    Values: `source`, `count`, `decides`, and lists with an entry for each reading: `readings` in words,
+    `options` that choose it, as a shell takes them, and `translations_mm` of its X, empty where X does not
+    differ.
     """
 
     code = "several-readings"
@@ -231,21 +230,23 @@ class SeveralReadingsError(ImportSourceError):
     """What stands; empty in an error that came over the wire."""
 
 
-def several_readings(source: Path, readings: Sequence[StandingReading], decides: str) -> SeveralReadingsError:
-    """An error that asks which of `readings` is meant; `decides`: a sentence on what would decide."""
-    told: dict[str, Value] = {}
-    for n, each in enumerate(readings, 1):
-        told[f"reading_{n}"] = each.text
-        told[f"options_{n}"] = each.command
-        if each.translation_mm is not None:
-            told[f"translation_{n}_mm"] = ", ".join(f"{part:.1f}" for part in each.translation_mm)
+def several_readings(
+    source: Path, readings: Sequence[StandingReading], decides: str, code: str = "several-readings"
+) -> SeveralReadingsError:
+    """Make the error that asks which of `readings` is meant.
+
+    `decides`: a sentence on what would decide. `code`: several-sets or which-poses where the readings differ
+    by what is read, not by how.
+    """
     error = SeveralReadingsError(
-        "several-readings",
+        code,
         source=source,
         count=len(readings),
         listed="; ".join(f"({n}) {each.line}" for n, each in enumerate(readings, 1)),
         decides=decides,
-        **told,
+        readings=[each.text for each in readings],
+        options=[each.command for each in readings],
+        translations_mm=[each.translation_text for each in readings],
     )
     error.readings = tuple(readings)
     return error

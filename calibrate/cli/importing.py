@@ -20,10 +20,8 @@ from calibrate.imported import Given, believe, is_described
 from calibrate.job import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.errors import (
-    AmbiguousSourceError,
     SeveralReadingsError,
     StandingReading,
-    several_readings,
 )
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, import_bag
@@ -135,10 +133,6 @@ def import_command(
             if as_json or not sys.stdin.isatty():
                 raise
             reading = reading.with_options(_asked(problem, console).options)
-        except AmbiguousSourceError as several:
-            if as_json or not sys.stdin.isatty():
-                raise
-            reading = reading.with_options(_asked(_as_readings(several), console).options)
     size_bytes = target.stat().st_size if target else 0
     facts = ImportJson(str(target or ""), done.images, size_bytes, done.facts, done.unused)
     if as_json:
@@ -193,17 +187,6 @@ def _asked(problem: SeveralReadingsError, console: Console) -> StandingReading:
             raise problem
         if answer.strip() in numbers:
             return numbers[answer.strip()]
-
-
-def _as_readings(several: AmbiguousSourceError) -> SeveralReadingsError:
-    """The same question in the words of the other."""
-    sets = several.values["sets"]
-    choices = several.values["choices"]
-    assert isinstance(sets, list)
-    assert isinstance(choices, list)
-    option = str(several.values["option"]).removeprefix("--")
-    readings = [StandingReading(each, {option: choice}) for each, choice in zip(sets, choices, strict=True)]
-    return several_readings(Path(str(several.values["source"])), readings, "")
 
 
 def _told(source: Path, output: Path | None) -> Dataset | None:

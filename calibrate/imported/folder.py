@@ -35,7 +35,12 @@ from calibrate.imported.table_readings import (
     table_readings,
     without_boards_own,
 )
-from recordings.errors import AmbiguousSourceError, ImportSourceError
+from recordings.errors import (
+    ImportSourceError,
+    SeveralReadingsError,
+    StandingReading,
+    several_readings,
+)
 from recordings.image_headers import ImageError, read_header
 from recordings.importers.conventions import (
     OPTICAL_FROM_AXES,
@@ -215,15 +220,11 @@ def _same_cell(one: TableReading, other: TableReading) -> bool:
     return any(np.abs(T - other.fit.X[0]).max() < _SAME for T in places)
 
 
-def _several(held: Contents, sets: list[tuple[str, str]]) -> AmbiguousSourceError:
+def _several(held: Contents, sets: list[tuple[str, str]]) -> SeveralReadingsError:
     """Which of several sets is meant; `sets`: images, or poses of the board, and the robot's poses beside."""
-    return AmbiguousSourceError(
-        "several-sets",
-        source=held.root,
-        sets=[f"{seen} with {robot}" for seen, robot in sets],
-        option="--images",
-        choices=[seen for seen, _ in sets],
-    )
+    readings = [StandingReading(f"{seen} with {robot}", {"images": seen}) for seen, robot in sets]
+    decides = "Or give the subfolder of one set as SOURCE, or the robot's poses of one by --poses."
+    return several_readings(held.root, readings, decides, "several-sets")
 
 
 def _row_names(images: ImageSet) -> str:
@@ -242,11 +243,14 @@ def _no_pairs(held: Contents, robots: list[Table]) -> ImportSourceError:
         said["tables"] = _listed([f"{len(table.numbers)} {table.name}" for table in robots])
         return ImportSourceError("told-poses-unpaired", source=held.root, **said)
     if alike and not held.images:
-        names = [f"{len(table.numbers)} rows of {table.name}" for table in alike]
-        choices = [table.name for table in alike]
-        return AmbiguousSourceError(
-            "which-poses", source=held.root, sets=names, option="--poses", choices=choices
-        )
+        readings = [
+            StandingReading(
+                f"{len(table.numbers)} rows of {table.name} are the robot's", {"poses": table.name}
+            )
+            for table in alike
+        ]
+        decides = "The program that wrote the tables decides."
+        return several_readings(held.root, readings, decides, "which-poses")
     beside: list[list[Path] | Table] = list(held.images.values())
     beside += [table for table in held.tables if table not in robots]
     pairs = max((len(pairs_of(robot, other)) for robot in robots for other in beside), default=0)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from calibrate.geometry import pose, rotation_exp
 from calibrate.imported import Given, believe, board
 from recordings.cli import main
-from recordings.errors import AmbiguousSourceError
+from recordings.errors import SeveralReadingsError
 from recordings.importers.tables import look
 from recordings.reader import open_recording
 from tests.calibrate.pose_files import euler, quaternions
@@ -300,6 +300,12 @@ def two_sessions(name: str, table: str) -> Callable[[Shots, Path], Iterator[tupl
     return write
 
 
+def choices_of(asked: BaseException) -> list[str]:
+    """What the one option of each choice takes."""
+    assert isinstance(asked, SeveralReadingsError)
+    return [value for reading in asked.readings for value in reading.options.values()]
+
+
 SESSIONS = {
     "folders": two_sessions("sSESSION/img_{n}.png", "sSESSION/robot.txt"),
     "folders below": two_sessions("data/run_SESSION/images/img_{n}.png", "data/run_SESSION/robot.txt"),
@@ -312,10 +318,9 @@ SESSIONS = {
 @pytest.mark.parametrize("what", SESSIONS)
 def test_sessions_are_never_mixed(what: str, shots: Shots, tmp_path: Path) -> None:
     sessions = list(SESSIONS[what](shots, tmp_path))
-    with raises("several-sets", AmbiguousSourceError, option="--images") as asked:
+    with raises("several-sets", SeveralReadingsError) as asked:
         believe(look(tmp_path), GIVEN)
-    choices = asked.value.values["choices"]
-    assert isinstance(choices, list)
+    choices = choices_of(asked.value)
     assert {frozenset(require_right(shots, tmp_path, replace(GIVEN, images=each))) for each in choices} == {
         frozenset({"one"}),
         frozenset({"two"}),
@@ -380,10 +385,9 @@ def test_two_cameras_are_asked_about(first: str, second: str, shots: Shots, tmp_
     save_images(shots, tmp_path, first, "one")
     save_images(shots, tmp_path, second, "beside")
     np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
-    with raises("several-sets", AmbiguousSourceError) as asked:
+    with raises("several-sets", SeveralReadingsError) as asked:
         believe(look(tmp_path), GIVEN)
-    choices = asked.value.values["choices"]
-    assert isinstance(choices, list)
+    choices = choices_of(asked.value)
     taken = [require_right(shots, tmp_path, replace(GIVEN, images=each)) for each in choices]
     assert sorted(map(sorted, taken)) == [["beside"], ["one"]]
 
@@ -472,10 +476,9 @@ def test_sessions_of_pairs_are_never_mixed(name: str, tmp_path: Path) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             np.savetxt(path, quaternions(np.array(poses)))
     given = Given(mount="eye-in-hand")
-    with raises("several-sets", AmbiguousSourceError, option="--images") as asked:
+    with raises("several-sets", SeveralReadingsError) as asked:
         believe(look(tmp_path), given)
-    choices = asked.value.values["choices"]
-    assert isinstance(choices, list)
+    choices = choices_of(asked.value)
     for choice, scene in zip(choices, scenes.values(), strict=True):
         rows = believe(look(tmp_path), replace(given, images=choice)).rows
         np.testing.assert_allclose([row.base_from_flange for row in rows], scene.flange_poses()[0], atol=1e-6)
@@ -497,10 +500,9 @@ def test_a_number_that_tells_two_things_apart_is_not_folded(name: str, tmp_path:
     scene = Scene(views=12)
     robot, seen = scene.flange_poses()[0], scene.camera_from_board()
     camodocals(tmp_path, robot, seen, name)
-    with raises("which-poses", AmbiguousSourceError, option="--poses") as asked:
+    with raises("which-poses", SeveralReadingsError) as asked:
         believe(look(tmp_path))
-    choices = asked.value.values["choices"]
-    assert isinstance(choices, list)
+    choices = choices_of(asked.value)
     rows = believe(look(tmp_path, Path(choices[0])), Given("moveit", "eye-in-hand")).rows
     np.testing.assert_allclose([row.base_from_flange for row in rows], robot, atol=1e-6)
     np.testing.assert_allclose([row.camera_from_board for row in rows], seen, atol=1e-6)

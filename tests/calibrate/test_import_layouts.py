@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -458,8 +459,9 @@ def test_the_question_is_for_programs_too(shots: Shots, tmp_path: Path) -> None:
     assert asked.returncode == 2
     error = json.loads(asked.stdout)["error"]
     assert error["code"] == "several-sets"
-    assert error["values"]["choices"] == ["a/#.png", "b/#.png"]
-    answered = call(main, *told, error["values"]["option"], error["values"]["choices"][1])
+    options = [shlex.split(each) for each in error["values"]["options"]]
+    assert options == [["--images", "a/#.png"], ["--images", "b/#.png"]]
+    answered = call(main, *told, *options[1])
     assert answered.returncode == 0, answered.stderr
     assert any("a/#.png" in line for line in json.loads(answered.stdout)["not_used"])
 

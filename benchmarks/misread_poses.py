@@ -59,7 +59,7 @@ MISREAD = {
     "quaternions of another order": Misread("wxyz", "xyzw", "other-convention"),
     "millimetres told as metres": Misread("matrix-mm", "matrix", "other-convention"),
     "inverted poses": Misread("matrix", None, "read", inverse, name="base2gripper.txt"),
-    "another mounting": Misread("xyzw", None, "which-mount", other_mount=True),
+    "another mounting": Misread("xyzw", None, "mount-contradicted", other_mount=True),
     "each image with the pose before": Misread(
         "rotvec", None, "shifted-pictures", lambda T: np.roll(T, 1, axis=0)
     ),

@@ -2,15 +2,17 @@
 
 Three things are asked: the mounting, and whether the robot's and the board's poses are inverted. A camera in
 hand fits exactly as well as a fixed one with inverted poses, so the motion gives one of the three once the
-other two are known. A convention that the user tells and recorded joints decide. Else no two may contradict
-each other: the mounting that the user tells, names, what the images show around the board, and the distances
-of camera and board from flange and base. Of the last two alone both are needed.
+other two are known. What the user tells decides, and recorded joints do: they may not contradict each other.
+A single hint against what is told is named beside it, two are a question. Where nothing is told hints decide,
+no two of which may contradict each other: names, what the images show around the board, and the distances of
+camera and board from flange and base. Of the last two alone both are needed.
 """
 
 from __future__ import annotations
 
 import re
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,6 +30,8 @@ _MOST_ROWS = 100
 _NEARER = 3.0
 """So many times as far from the base as from the flange, and beyond the reach over this, stands what the arm
 does not carry: a looser bound would leave rigs with long tools to guesses."""
+_CONTRADICTED = 2
+"""Hints, each of another kind, against a mounting that is told: the user may have taken one for the other."""
 _IN_HAND = re.compile(
     r"eye_?(in|on)_?hand|hand_?(in|on)_?eye|hand_in\b|\beih\b|cam\w*2(gripper|end|ee|tool|flange|hand)"
     r"|attached_on_robot|in_hand|inhand|flange2cam|hand_camera|static_camera false",
@@ -50,34 +54,74 @@ def mounting(
     """(mounting, whether the robot's poses are inverted, why) of images: of pairs see `pair_readings`.
 
     `as_told`: by the user's convention the direction is told, too. `by_joints`: whether joints say that the
-    robot's poses are inverted. Raises ImportSourceError (`which-mount`) where nothing decides, or one
-    contradicts another.
+    robot's poses are inverted. Raises ImportSourceError: `which-mount` where nothing decides, or one hint
+    contradicts another; `joints-contradict`, `mount-contradicted` where what was told is contradicted.
     """
-    name, seen, fits = best.table.name, best.seen, best.mount
+    fits = best.mount
     by_turn: dict[bool | None, set[Mount]] = {None: set(), False: {fits}, True: {OTHER_MOUNT[fits]}}
-    told = ({given} if given else set()) | by_turn[False if as_told else None]
-    evidence = {"joints": by_turn[by_joints]}
-    possible = told | by_turn[by_joints]
-    if not as_told and by_joints is None:
-        by_distances, far_apart = inverted_by_distances(best)
-        straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
-        turned = inverted if straight != inverted else None
-        named = mount_named(held, best)
-        images = [(seen.images[view.index], view) for view in best.views] if seen.images else []
-        names, scene = by_turn[turned] | named, mount_by_scene(images, seen.camera)
-        evidence = {"names": names, "the scene around the board": scene, far_apart: by_turn[by_distances]}
-        # A bare wall, a gripper in the picture, or a frame at the table deceives one of the two alone.
-        if given or names or (scene and by_turn[by_distances]):
-            possible = told.union(*evidence.values())
-    why = [(what, says) for what, says in evidence.items() if says]
-    if len(possible) != 1:
-        said = "; ".join(f"{' or '.join(sorted(says))} by {what}" for what, says in why)
+    told = {given} if given else by_turn[False if as_told else None]
+    by_arm = by_turn[by_joints]
+    if told and by_arm and told != by_arm:
         raise ImportSourceError(
-            "which-mount", source=held.root, mount=fits, table=name, said=said or "nothing tells which"
+            "joints-contradict",
+            source=held.root,
+            table=best.table.name,
+            told=_either(told),
+            fits=_either(by_arm),
         )
+    hints = {} if as_told or by_arm else _hints(held, best, by_turn)
+    if known := told | by_arm:
+        (mount,) = known
+        against = {what: says for what, says in hints.items() if says - known}
+        if len(against) >= _CONTRADICTED:
+            turned = replace(best.convention, inverse=best.convention.inverse != (mount != fits))
+            raise ImportSourceError(
+                "mount-contradicted",
+                source=held.root,
+                told=mount,
+                table=best.table.name,
+                said=_said(against),
+                convention=turned.name,
+            )
+        doubt = f", against {' and '.join(against)}" if against else ""
+        by = "as told" if given else "by the convention as told" if told else "by joints"
+        return mount, mount != fits, f"{by}{doubt}; {best.table.name}"
+    # A bare wall, a gripper in the picture, or a frame at the table deceives one of the last two alone.
+    names, scene, distances = hints.values()
+    possible = names | scene | distances if names or (scene and distances) else set()
+    why = {what: says for what, says in hints.items() if says}
+    if len(possible) != 1:
+        said = _said(why) or "nothing tells which"
+        raise ImportSourceError("which-mount", source=held.root, mount=fits, table=best.table.name, said=said)
     (mount,) = possible
-    by = "as told" if given else f"by {', '.join(what for what, _ in why)}; {name}"
-    return mount, mount != fits, by
+    return mount, mount != fits, f"by {', '.join(why)}; {best.table.name}"
+
+
+def _hints(
+    held: Contents, best: TableReading, by_turn: dict[bool | None, set[Mount]]
+) -> dict[str, set[Mount]]:
+    """What names, scene and distances say, in this order: hint → mountings; empty where it says nothing.
+
+    `by_turn`: the mounting if the robot's poses are inverted, or not.
+    """
+    straight = bool(_TOOL_IN_BASE.search(best.table.name))
+    inverted = bool(_BASE_IN_TOOL.search(best.table.name))
+    turned = inverted if straight != inverted else None
+    images = [(best.seen.images[view.index], view) for view in best.views] if best.seen.images else []
+    by_distances, far_apart = inverted_by_distances(best)
+    return {
+        "names": by_turn[turned] | mount_named(held, best),
+        "the scene around the board": mount_by_scene(images, best.seen.camera),
+        far_apart: by_turn[by_distances],
+    }
+
+
+def _said(hints: dict[str, set[Mount]]) -> str:
+    return "; ".join(f"{_either(says)} by {what}" for what, says in hints.items())
+
+
+def _either(mounts: set[Mount]) -> str:
+    return " or ".join(sorted(mounts))
 
 
 def inverted_by_distances(best: TableReading) -> tuple[bool | None, str]:

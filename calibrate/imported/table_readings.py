@@ -298,7 +298,7 @@ def decide(
         fits = replace(ranked[0].convention, inverse=mount not in (None, ranked[0].mount)).name
         raise ImportSourceError("other-convention", source=held.root, told=named, fits=fits)
     if not mine or beaten or not is_good(mine[0]):
-        nearest = _nearest([*dict.fromkeys(ranked[:_EXPLAINED] + mine[:_EXPLAINED])])
+        nearest = _nearest(held, [*dict.fromkeys(ranked[:_EXPLAINED] + mine[:_EXPLAINED])], named, mount)
         as_told = named and mount and mine and mine[0].seen.square_known
         # That positions disagree says that something is wrong, not how to read it: outliers do the same.
         read_otherwise = nearest["cause"] not in ("", Reading.POSITIONS_DISAGREE.value)
@@ -329,19 +329,39 @@ def _beats(one: TableReading, other: TableReading) -> bool:
     return one.log_evidence - other.log_evidence > clear_gain(len(one.fit.full))
 
 
-_CHECK_IMAGES = (
-    "Check that the rows are the flange's poses, not joints, and belong to these images; name them by "
-    "--poses and --board. A reading is taken as told, and the solve judges it, where --convention, --mount "
-    "and --board are all given."
-)
-_CHECK_PAIRS = (
-    "Check that both tables were written at the same stops in the same order, and that the robot's holds the "
-    "flange's poses, not joints; name it by --poses. A reading is taken as told, and the solve judges it, "
-    "where --convention and --mount are given."
-)
+def _left_to_tell(held: Contents, nearest: TableReading, named: str | None, mount: Mount | None) -> list[str]:
+    """Options not given that would say how this reading is meant: no error asks for what was told."""
+    given = {
+        "--poses": held.told is not None,
+        "--board": nearest.seen.square_known,
+        "--convention": named is not None,
+        "--mount": mount is not None,
+    }
+    return [option for option, is_given in given.items() if not is_given]
 
 
-def _nearest(readings: list[TableReading]) -> dict[str, Any]:
+def _advice(is_pairs: bool, options: list[str]) -> str:
+    """What to check, and the options that are left to tell."""
+    if is_pairs:
+        check = (
+            "Check that both tables were written at the same stops in the same order, and that the robot's "
+            "holds the flange's poses, not joints."
+        )
+    else:
+        check = "Check that the rows are the flange's poses, not joints, and belong to these images."
+    if not options:
+        return check
+    return f"{check} A reading that is told whole is taken, and the solve judges it: add {_and(options)}."
+
+
+def _and(options: list[str]) -> str:
+    *others, last = options
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def _nearest(
+    held: Contents, readings: list[TableReading], named: str | None, mount: Mount | None
+) -> dict[str, Any]:
     """The reading nearest to right, and what would make it right, as a solve names it."""
     explained = [_explained(reading) for reading in readings]
     gains = [found.log_evidence_gain if found.reading in _CAUSES else 0.0 for found in explained]
@@ -350,12 +370,14 @@ def _nearest(readings: list[TableReading]) -> dict[str, Any]:
     cause = found.reading.value if found.reading in _CAUSES else ""
     text = f". {explain_text(found, best.views)}".rstrip(".") if cause else ""
     pairs = best.seen.convention is not None
+    options = _left_to_tell(held, best, named, mount)
     near = {
         "nearest": best.text,
         "stays_m": best.stays_m,
         "stays_rad": best.stays_rad,
         "seen": f"the board's poses, {best.family}" if pairs else "the board in the images",
-        "advice": _CHECK_PAIRS if pairs else _CHECK_IMAGES,
+        "advice": _advice(pairs, options),
+        "options": options,
     }
     return {**near, "cause": cause, "text": text}
 

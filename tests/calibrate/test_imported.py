@@ -19,6 +19,7 @@ from calibrate.files.install import install
 from calibrate.imported import Given, believe, board
 from calibrate.job import JobOptions, solve_recording
 from calibrate.kinematics import MODELS
+from calibrate.lens.pnp import Candidate
 from calibrate.report.page import report_page
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
@@ -178,8 +179,10 @@ def test_distances_of_camera_and_board_contradict_but_do_not_tell_the_mounting_a
         believe(look(folder))
     found = believe(look(folder), Given(mount="eye-in-hand"))
     np.testing.assert_allclose([row.base_from_flange for row in found.rows], images[1], atol=1e-6)
-    with raises("which-mount"):
-        believe(look(folder), Given(mount="eye-to-hand"))
+    against = believe(look(folder), Given(mount="eye-to-hand"))
+    assert against.dataset.mount == "eye-to-hand", "what is told wins over what deceives now and then"
+    turned = np.linalg.inv(images[1])
+    np.testing.assert_allclose([row.base_from_flange for row in against.rows], turned, atol=1e-6)
     (folder / "rig-eih.txt").write_text("of a camera in hand")
     assert believe(look(folder)).dataset.mount == "eye-in-hand"
     (folder / "rig-eih.txt").unlink()
@@ -314,6 +317,30 @@ def test_recorded_joints_tell_the_mounting(
     assert found.facts["mount"][1].startswith("by joints")
 
 
+def test_joints_contradict_a_mounting_that_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are the arm's own motion, no hint: neither side is taken."""
+    cell = arm_cell("ur", "eye-in-hand", 0.1, 1, views=16)
+    paths = [tmp_path / f"{n}.png" for n in range(16)]
+    for path in paths:
+        cv2.imwrite(str(path), np.zeros((8, 8), np.uint8))
+    seen = board.Seen(
+        TURNED.board,
+        True,
+        dict(zip(paths, cell.views.views, strict=True)),
+        {path: [Candidate(T, 0)] for path, T in zip(paths, cell.views.camera_from_board, strict=True)},
+        cell.views.camera,
+        True,
+        16,
+    )
+    monkeypatch.setattr("calibrate.imported.folder.see_board", lambda held, given, paths, progress: seen)
+    joints = np.array([view.joints_rad for view in cell.views.views])
+    np.savetxt(tmp_path / "joints.csv", joints, fmt="%.6f", delimiter=",")
+    rotation_vectors(tmp_path, cell.views.base_from_flange)
+    assert believe(look(tmp_path), Given(mount="eye-in-hand")).dataset.mount == "eye-in-hand"
+    with raises("joints-contradict", told="eye-to-hand", fits="eye-in-hand"):
+        believe(look(tmp_path), Given(mount="eye-to-hand"))
+
+
 def test_circles_that_nobody_described_are_found(tmp_path: Path) -> None:
     circles = BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 7, 0.012)
     recording = open_recording(write_session(tmp_path / "s.mcap", Scene(circles, views=8)))
@@ -387,8 +414,9 @@ def test_one_of_two_tables_is_named_the_robots_and_a_reading_told_whole_is_taken
         found = believe(held, Given("ur-rotvec", "eye-in-hand"))
         np.testing.assert_allclose([row.base_from_flange for row in found.rows], robot, atol=1e-6)
         wrong = {"nearest": "a.txt: eye-in-hand, rotvec"} if noise_m else {"fits": "rotvec"}
-        with raises("no-reading" if noise_m else "other-convention", **wrong):
+        with raises("no-reading" if noise_m else "other-convention", **wrong) as refused:
             believe(held, Given("euler-ZYX", "eye-in-hand"))
+        assert refused.value.values.get("options", []) == [], "nothing that was told is asked for"
 
 
 @pytest.mark.skipif(not MOVEIT.is_file(), reason="the pose pairs of MoveIt's own test are not here")

@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, settings
 
 from station.cell.config import ControlPath
 from station.devices.ur import library_installed
-from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
+from station.devices.ur.moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from station.simulation.netns import bring_lo_up
 from tests.patience import PATIENCE_S

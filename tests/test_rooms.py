@@ -57,6 +57,8 @@ PLANTS = [
     ("station/analysis", "textual"),
     ("station/cell", "station.protocol"),
     ("station/devices", "station.plan"),
+    ("station/devices", "station.devices.ur.robot"),
+    ("station/devices/ur", "station.session"),  # and it has no floor
     ("station/operate", "station.session"),
     ("station/session", "serial"),
     ("station/session", "station.protocol.client"),

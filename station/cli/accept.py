@@ -31,7 +31,7 @@ from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Socket, err, print_json
 from station.cli.session import Attended, attended, confirmed, no_terminal
-from station.devices.ur_state import TraceRecorder
+from station.devices.ur import TraceRecorder
 from station.operate.motion import prepared_motion
 from station.operate.stop_judge import WATCHED_S, judge
 from station.protocol.client import DaemonGoneError

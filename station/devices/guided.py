@@ -3,40 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 
-from calibrate.kinematics import MODELS
-from station.cell.config import CameraChoice, CameraConfig, RobotConfig
-from station.cell.errors import RobotError
+from station.cell.config import CameraChoice, CameraConfig
 from station.devices.aravis import AravisCamera
 from station.devices.base import Camera
 from station.devices.discovery import discover, discover_usb
-from station.devices.ur_dashboard import STOP, STOPPED
-from station.devices.ur_link import UrLink
-from station.devices.ur_probe import identify, open_dashboard, unsupported_model
+from station.devices.ur import GuidedArm
 from station.devices.webcam import WebcamCamera, discover_webcams
-
-
-class GuidedArm(UrLink):
-    """The read-only half of the driver, and STOP."""
-
-    def trouble(self) -> str:
-        """Why the arm cannot be guided now, and what to do on the pendant; empty: nothing."""
-        try:
-            return self.condition(self.latest()).held
-        except RobotError as problem:
-            return str(problem)
-
-    async def stop(self) -> None:
-        """STOP, by the dashboard: it ends whatever program runs on the controller. RobotError if refused."""
-        said = ""
-        if self.dashboard is not None:
-            with contextlib.suppress(RobotError):
-                said = await self.dashboard.ask(STOP)
-        if said != STOPPED:  # dead, or opened in local control: refused even after the switch to remote
-            said = await (await self.renew_dashboard()).ask(STOP)
-        if said != STOPPED:
-            raise RobotError("stop-refused", answer=said)
 
 
 class RealHardware:
@@ -47,18 +20,7 @@ class RealHardware:
 
         `host` may be followed by the model, for a controller that does not tell it.
         """
-        address, _, told = host.partition(" ")
-        dashboard = await open_dashboard(address)
-        found = await identify(dashboard)
-        await dashboard.close()
-        model = told or found.model
-        if found.model and found.model not in MODELS:
-            raise unsupported_model(found.model, address)
-        if model not in MODELS:
-            raise RobotError("model-not-told", host=address, known=", ".join(MODELS))
-        arm = GuidedArm(RobotConfig(model=model, host=address))
-        await arm.connect()
-        return arm
+        return await GuidedArm.connected_to(host)
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
         """Cameras that answer now. Raises CameraError."""

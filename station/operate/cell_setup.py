@@ -20,7 +20,8 @@ from station.cell.layout import flange_pose
 from station.cell.status import GuidanceStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import Camera
-from station.devices.guided import GuidedArm, RealHardware
+from station.devices.guided import RealHardware
+from station.devices.ur import GuidedArm
 from station.operate import draft as drafts
 from station.operate.draft import POSTED, CellStep, Draft
 

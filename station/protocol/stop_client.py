@@ -12,28 +12,29 @@ From a person to the wire, by files and functions in `station/` (tests/test_page
   In the daemon: approval and run end, the state is STOPPED, the arm is stopped.
     `server/stop_server.py:StopServer._woken, _read, _carry_out`,
     `server/dispatch.py:SessionDispatcher.stop_by_datagram`, `session/session.py:Session.stop, _halt,
-    _stop_arm`, `devices/ur.py:UrRobot.stop`. The socket is also read at the beginning of every round of the
-    session: `session/supervisor.py:SessionSupervisor._round`, `server/stop_server.py:StopServer.round`.
+    _stop_arm`, `devices/ur/robot.py:UrRobot.stop`. The socket is also read at the beginning of every round
+    of the session: `session/supervisor.py:SessionSupervisor._round`,
+    `server/stop_server.py:StopServer.round`.
   From there by two ways at once; neither waits for the other:
     The robot's dashboard: b"stop\\n" to port 29999, also where the station has no control.
-      `devices/ur_dashboard.py:Dashboard.send`.
+      `devices/ur/dashboard.py:Dashboard.send`.
     The control process: {"do": "stop", "deceleration": 4.0} on its socket, rad/s²; it calls stopJ(4.0) of
       ur_rtde, or of the station's own script, which gets an RTDE data packet (type "U") with the command
-      STOP: stopj(4.0) where it moves, then halt. `devices/ur_child.py:ControlChild.stop, _send`,
-      `devices/ur_control.py:MotionServer.serve`, `devices/ur_script.py:ScriptControl.stopJ`.
+      STOP: stopj(4.0) where it moves, then halt. `devices/ur/child.py:ControlChild.stop, _send`,
+      `devices/ur/control.py:MotionServer.serve`, `devices/ur/script.py:ScriptControl.stopJ`.
   Where the dashboard does not answer "Stopped" within 50 ms it is asked once more, on a new connection. The
     control process is killed once it answered, at most 0.1 s after STOP; a program that it left playing is
     stopped.
-    `devices/ur.py:UrRobot._finish_stop, _dashboard_stop_anew, _stop_leftover_program`.
+    `devices/ur/robot.py:UrRobot._finish_stop, _dashboard_stop_anew, _stop_leftover_program`.
   Where the daemon hangs, no way above is left. Its session beats no more, the control process resets the
     watchdog of the program at the controller only for a beat of the last 0.1 s, and 0.2 s after the last one
     the watchdog stops the arm (decision 0045).
-    `session/supervisor.py:SessionSupervisor._round`, `devices/ur_control.py:MotionServer._beat`.
+    `session/supervisor.py:SessionSupervisor._round`, `devices/ur/control.py:MotionServer._beat`.
   The same from the function named: the verb, `server/connections.py:_take`; Ctrl-C at a command,
     `cli/session.py:attended`; signals to the daemon, `daemon.py:Daemon.end`; a client in control that is
     gone, `server/dispatch.py:SessionDispatcher.gone`.
   F12 in `station new`: no daemon runs yet, the dashboard alone. `tui/new_cell.py:NewCell.action_stop`,
-    `devices/guided.py:GuidedArm.stop`, `devices/ur_dashboard.py:Dashboard.ask`.
+    `devices/ur/guided_arm.py:GuidedArm.stop`, `devices/ur/dashboard.py:Dashboard.ask`.
 
 STOP is sent to whatever listens on the socket. It is reported as done only if the genuine daemon says so on
 the motion page, a small file beside the socket that only the daemon's user can have made. It tells how many

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from station.devices.ur_dashboard import ALLOWED, PORT, Dashboard
-from station.devices.ur_script import SCRIPT_PORT
+from station.devices.ur.dashboard import ALLOWED, PORT, Dashboard
+from station.devices.ur.script import SCRIPT_PORT
 from station.simulation.launch import start_controller
 from tests.conftest import not_allowed
 from tests.patience import wait_until
@@ -107,7 +107,7 @@ def test_the_vendors_library_has_one_door_and_an_example_that_only_reads() -> No
                 for library in (name.split(".")[0] for name in names)
                 if library in ("rtde_control", "rtde_receive", "rtde_io")
             }
-    assert doors == {("ur_control.py", "rtde_control"), (READS_ALONE, "rtde_receive")}
+    assert doors == {("control.py", "rtde_control"), (READS_ALONE, "rtde_receive")}
 
 
 _JOINTS = "[0, -1.5708, 1.5708, -1.5708, -1.5708, 0.01]"

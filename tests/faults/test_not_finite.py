@@ -10,9 +10,9 @@ import pytest
 from station.cell.errors import StaleStateError
 from station.cell.stillness import fastest_rad_s
 from station.devices.ur import UrRobot
-from station.devices.ur_moves import MoveWatch
-from station.devices.ur_state import Payload
-from station.devices.ur_tool import check_payload
+from station.devices.ur.moves import MoveWatch
+from station.devices.ur.state import Payload
+from station.devices.ur.tool import check_payload
 from station.session.motion import require_start
 from tests.codes import raises
 from tests.faults.conftest import MakeCell

@@ -14,7 +14,6 @@ import pytest
 from recordings.errors import ErrorData
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError
-from station.devices import ur_link
 from station.devices.rtde import RobotMode
 from station.devices.ur import UrRobot
 from station.simulation.launch import SimulatedController, start_controller
@@ -90,7 +89,7 @@ async def test_no_tool_is_taken_from_a_controller_that_is_still_starting(
     robot = robot_at(arm.host, tmp_path)
     with arm.admin() as admin, monkeypatch.context() as patch:
         admin.ask("power_off")  # in place of booting, which the simulator does not show
-        patch.setattr(ur_link, "STARTING", (RobotMode.POWER_OFF,))
+        patch.setattr("station.devices.ur.link.STARTING", (RobotMode.POWER_OFF,))
         with raises("not-powered"):
             await robot.connect()
     await robot.connect()

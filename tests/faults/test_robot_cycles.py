@@ -96,7 +96,7 @@ async def test_a_thousand_cycles(cell: MakeCell) -> None:
 async def test_ten_minutes_at_full_rate_without_a_lost_sample(
     controller: Callable[..., SimulatedController],
 ) -> None:
-    from station.devices.ur_state import StateReader
+    from station.devices.ur.state import StateReader
 
     seconds: float = 600
     count, skipped, before_s = 0, 0, 0.0

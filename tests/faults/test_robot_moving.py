@@ -14,7 +14,7 @@ from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.base import ready
 from station.devices.news import Delay
 from station.devices.ur import UrRobot
-from station.devices.ur_child import ControlChild
+from station.devices.ur.child import ControlChild
 from tests.codes import raises
 from tests.faults.conftest import Cell, MakeCell, child_gets
 from tests.patience import until
@@ -97,7 +97,7 @@ async def test_a_connection_heard_of_as_lost_only_later_is_what_is_told(
         return StaleStateError(Delay.COMPUTER)
 
     c = await cell()
-    monkeypatch.setattr("station.devices.ur.cause_of_end", heard_meanwhile)
+    monkeypatch.setattr("station.devices.ur.robot.cause_of_end", heard_meanwhile)
     assert (await c.strike({"cmd": "stop_program"})).code == "link-lost"
 
 
@@ -164,7 +164,7 @@ async def test_a_program_paused_on_the_pendant_does_not_go_on_when_play_is_press
 async def test_a_lost_link_is_named_although_it_may_be_back_already(
     cell: MakeCell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("station.devices.ur.POLL_S", 1.0)  # a computer that looks again only then
+    monkeypatch.setattr("station.devices.ur.robot.POLL_S", 1.0)  # a computer that looks again only then
     assert (await (await cell()).strike(cut("rst", None))).code == "link-lost"
 
 
@@ -185,7 +185,7 @@ async def test_control_that_ended_between_two_moves_is_no_trouble_once_it_was_to
     cell: MakeCell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One approval continues at once, also before the next look at the robot."""
-    monkeypatch.setattr("station.devices.ur_link.RETRY_S", 600.0)
+    monkeypatch.setattr("station.devices.ur.link.RETRY_S", 600.0)
     c = await cell()
     control_pid = c.control_pid
     os.kill(control_pid, signal.SIGSTOP)

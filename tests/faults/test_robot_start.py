@@ -11,7 +11,7 @@ import pytest
 
 from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
-from station.devices.ur_state import StateReader
+from station.devices.ur.state import StateReader
 from tests.codes import raises
 from tests.faults.conftest import Cell, MakeCell, child_gets
 from tests.patience import PATIENCE_S, until

@@ -32,7 +32,7 @@ from station.cell.status import ArmCondition, CameraCounts, DetectionStatus, Eve
 from station.devices.cell import Cell
 from station.devices.news import Evidence
 from station.devices.ur import control_trouble
-from station.devices.ur_condition import condition
+from station.devices.ur.condition import condition
 from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.cells import cell_config, make_cell

@@ -14,7 +14,7 @@ import pytest
 from station.cell.arm_acceptance import Acceptance, StopWay, read_acceptance
 from station.cell.errors import RefusedError
 from station.cell.status import StationState as S
-from station.devices.ur_state import TraceRecorder
+from station.devices.ur import TraceRecorder
 from station.protocol.client import Client
 from station.protocol.verbs import Stop
 from station.simulation.launch import SimulatedController

@@ -38,7 +38,7 @@ def process_of(daemon: DaemonProcess, victim: str) -> int | None:
         return daemon.process.pid
     for child in children_of(daemon.process.pid):
         with contextlib.suppress(OSError):
-            controls = b"ur_control" in (child / "cmdline").read_bytes()
+            controls = b"ur.control" in (child / "cmdline").read_bytes()
             if controls == (victim == "control"):
                 return int(child.name)
     return None

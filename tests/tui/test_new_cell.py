@@ -19,7 +19,8 @@ from station.cell.config_file import load_config
 from station.cell.errors import CameraError, RobotError
 from station.cell.layout import guess_matrix
 from station.devices.base import Camera
-from station.devices.guided import GuidedArm, RealHardware
+from station.devices.guided import RealHardware
+from station.devices.ur import GuidedArm
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import CellStep
 from station.simulation.cells import make_cell

@@ -11,13 +11,13 @@ import pytest
 
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.config import RobotConfig
-from station.devices import ur_end_cause
 from station.devices.base import fresh
 from station.devices.news import Delay, Evidence, is_loopback, largest_gap, longest_silence_s
 from station.devices.rtde import RuntimeState
-from station.devices.ur_condition import program_ended
-from station.devices.ur_dashboard import DashboardError
-from station.devices.ur_link import UrLink
+from station.devices.ur.condition import program_ended
+from station.devices.ur.dashboard import DashboardError
+from station.devices.ur.end_cause import cause_of_end
+from station.devices.ur.link import UrLink
 from tests.codes import raises
 from tests.recordings.small_recording import PLAYING
 
@@ -160,8 +160,8 @@ def test_no_network_lies_before_an_address_of_this_computer(host: str, ours: boo
 async def test_what_was_late_ends_a_program_but_only_a_person_pauses_it(
     state: RuntimeState, code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ur_end_cause, "NEWS_WAIT_S", 0.0)
-    monkeypatch.setattr(ur_end_cause, "REPLACED_S", 0.0)
+    monkeypatch.setattr("station.devices.ur.end_cause.NEWS_WAIT_S", 0.0)
+    monkeypatch.setattr("station.devices.ur.end_cause.REPLACED_S", 0.0)
     made: Any = UrLink(RobotConfig(model="UR10", host="127.0.0.1"))
     now_s = time.monotonic()
     ended = msgspec.structs.replace(arrived(now_s), runtime_state=state)
@@ -169,4 +169,4 @@ async def test_what_was_late_ends_a_program_but_only_a_person_pauses_it(
         history=[arrived(now_s - 0.4), arrived(now_s - 0.1), ended], rate_hz=125.0, newest=None
     )
     child: Any = SimpleNamespace(started_s=now_s - 9.0, kicks_s=[now_s - 0.05 * k for k in range(20, 0, -1)])
-    assert (await ur_end_cause.cause_of_end(made, child, program_ended(state))).code == code
+    assert (await cause_of_end(made, child, program_ended(state))).code == code

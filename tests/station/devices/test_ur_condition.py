@@ -9,7 +9,7 @@ import pytest
 
 from recordings.schema.messages import RobotState
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
-from station.devices.ur_condition import arm_held, control_ended, foreign_program
+from station.devices.ur.condition import arm_held, control_ended, foreign_program
 from tests.recordings.small_recording import PLAYING
 
 SAFETY = {

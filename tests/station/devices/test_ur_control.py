@@ -20,9 +20,8 @@ import pytest
 
 from recordings.errors import ErrorData
 from station.cell.config import ControlPath
-from station.devices import ur_child
-from station.devices.ur_child import ControlChild
-from station.devices.ur_control import BEAT_FRESH_NS, WATCHDOG_HZ, MotionServer, open_control
+from station.devices.ur.child import ControlChild
+from station.devices.ur.control import BEAT_FRESH_NS, WATCHDOG_HZ, MotionServer, open_control
 from station.simulation.launch import SimulatedController
 from tests.codes import raises
 from tests.patience import PATIENCE_S
@@ -210,7 +209,7 @@ class Parent:
 
 @pytest.fixture
 async def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Parent]:
-    monkeypatch.setattr(ur_child, "REAP_S", 0.05)
+    monkeypatch.setattr("station.devices.ur.child.REAP_S", 0.05)
     made = Parent(tmp_path)
     yield made
     made.child.kill()

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from station.devices.ur_dashboard import PORT, Dashboard, DashboardError
-from station.devices.ur_probe import Found, identify
+from station.devices.ur.dashboard import PORT, Dashboard, DashboardError
+from station.devices.ur.probe import Found, identify
 from tests.codes import raises
 from tests.patience import PATIENCE_S
 

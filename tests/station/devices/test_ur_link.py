@@ -17,8 +17,8 @@ import pytest
 from station.cell.config import RobotConfig
 from station.devices.robot_lock import RobotLock
 from station.devices.rtde import HEADER, PORT, PacketType, packet
-from station.devices.ur_link import UrLink
-from station.devices.ur_probe import Found
+from station.devices.ur.link import UrLink
+from station.devices.ur.probe import Found
 from tests.codes import raises
 from tests.recordings.small_recording import PLAYING
 

@@ -9,7 +9,7 @@ import pytest
 
 from recordings.schema.messages import RobotState, Vector6
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
-from station.devices.ur_moves import MoveWatch, check_goal
+from station.devices.ur.moves import MoveWatch, check_goal
 from tests.codes import raises
 from tests.recordings.small_recording import PLAYING
 

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from station.cell.errors import RobotError
-from station.devices.ur_control import WATCHDOG_HZ
-from station.devices.ur_moves import JOINT_SPEED_LIMIT_RAD_S
-from station.devices.ur_script import (
+from station.devices.ur.control import WATCHDOG_HZ
+from station.devices.ur.moves import JOINT_SPEED_LIMIT_RAD_S
+from station.devices.ur.script import (
     FIRST_REGISTER,
     SILENCE_S,
     UNARMED_S,
@@ -321,7 +321,7 @@ def test_a_start_is_refused(
     fault: Any,
     code: str,
 ) -> None:
-    monkeypatch.setattr("station.devices.ur_script.START_S", 0.5)
+    monkeypatch.setattr("station.devices.ur.script.START_S", 0.5)
     admin.ask(**fault)
     time.sleep(0.2)
     with pytest.raises(RobotError) as caught:

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from station.devices import ur_state
-from station.devices.ur_state import StateReader
+from station.devices.ur.state import _TIMESPEC, SO_TIMESTAMPNS, StateReader
 
 S = 1_000_000_000
 MS = 1_000_000
@@ -25,8 +24,8 @@ class Clocks:
 
     def stamp(self) -> list[tuple[int, int, bytes]]:
         """Give the stamp of the kernel on bytes that come now."""
-        value = ur_state._TIMESPEC.pack(*divmod(self.now_ns + self.ahead_ns, S))
-        return [(socket.SOL_SOCKET, ur_state.SO_TIMESTAMPNS, value)]
+        value = _TIMESPEC.pack(*divmod(self.now_ns + self.ahead_ns, S))
+        return [(socket.SOL_SOCKET, SO_TIMESTAMPNS, value)]
 
 
 @pytest.fixture

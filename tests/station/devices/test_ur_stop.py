@@ -13,10 +13,9 @@ import pytest
 
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
-from station.devices import ur
 from station.devices.rtde import RuntimeState
 from station.devices.ur import UrRobot
-from station.devices.ur_dashboard import STOP
+from station.devices.ur.dashboard import STOP
 from tests.codes import raises
 from tests.patience import PATIENCE_S
 
@@ -57,7 +56,7 @@ async def ways() -> Ways:
 
 @pytest.fixture
 async def robot(ways: Ways, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(ur, "LEFTOVER_WAIT_S", 0)
+    monkeypatch.setattr("station.devices.ur.robot.LEFTOVER_WAIT_S", 0)
     made: Any = UrRobot(RobotConfig(model="UR10", host="127.0.0.1"), tmp_path)
     monkeypatch.setattr(made, "_dashboard_stop_anew", ways.anew)
     made.dashboard, made._child, made.control = ways, ways, True
@@ -120,7 +119,7 @@ async def test_a_program_that_starts_only_after_its_process_was_killed_is_stoppe
     robot: Any, ways: Ways, monkeypatch: pytest.MonkeyPatch, ready: bool
 ) -> None:
     """Killed before it was ready, its upload may be on the way; later nothing can start any more."""
-    monkeypatch.setattr(ur, "UPLOADED_S", PATIENCE_S)
+    monkeypatch.setattr("station.devices.ur.robot.UPLOADED_S", PATIENCE_S)
     ways.started_s *= ready
     shows(robot, RuntimeState.STOPPED, RuntimeState.STOPPED, RuntimeState.PLAYING)
     ways.ended.set()
@@ -131,7 +130,7 @@ async def test_a_program_that_starts_only_after_its_process_was_killed_is_stoppe
 async def test_so_is_one_that_starts_only_after_a_stop(
     robot: Any, ways: Ways, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ur, "UPLOADED_S", PATIENCE_S)
+    monkeypatch.setattr("station.devices.ur.robot.UPLOADED_S", PATIENCE_S)
     ways.started_s = 0.0
     shows(robot, RuntimeState.STOPPED, RuntimeState.PLAYING)
     ways.reply.set_result("Stopped")
@@ -143,7 +142,9 @@ async def test_so_is_one_that_starts_only_after_a_stop(
 async def test_control_starts_when_the_last_one_has_ended(
     robot: Any, ways: Ways, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ur, "ready", looks := AsyncMock(side_effect=RobotError("no-host")))
+    monkeypatch.setattr(
+        "station.devices.ur.robot.ready", looks := AsyncMock(side_effect=RobotError("no-host"))
+    )
     robot._child = None
     robot._later(ways.end())
     starting = asyncio.create_task(robot.start_control())

@@ -18,9 +18,8 @@ from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import RobotState, Vector6
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
-from station.devices import ur_tool
 from station.devices.ur import UrRobot
-from station.devices.ur_tool import PORT, Installation, PrimaryReader, TcpCheck, read_state
+from station.devices.ur.tool import PORT, Installation, PrimaryReader, TcpCheck, read_state
 from station.simulation.controller.primary import state
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
@@ -170,7 +169,7 @@ async def test_it_is_taken_where_no_picture_and_no_motion_relies_on_the_derived_
 async def test_a_controller_that_is_slow_to_state_its_tool_is_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(ur_tool, "SILENCE_S", PATIENCE_S)
+    monkeypatch.setattr("station.devices.ur.tool.SILENCE_S", PATIENCE_S)
     said, made = asyncio.Event(), SimulatedRobot(Settings(), Journal())
     made.tcp = TOOL
 
@@ -191,7 +190,7 @@ async def test_a_controller_that_is_slow_to_state_its_tool_is_waited_for(
 
 
 async def test_a_port_that_is_opened_late_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ur_tool, "RETRY_S", 0.01)
+    monkeypatch.setattr("station.devices.ur.tool.RETRY_S", 0.01)
     made = SimulatedRobot(Settings(), Journal())
     made.tcp = TOOL
 

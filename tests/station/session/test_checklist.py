@@ -39,7 +39,7 @@ async def check(rig: Rig, name: str) -> Check:
 async def test_what_drives_the_arm_is_said(
     rig: Rig, monkeypatch: pytest.MonkeyPatch, path: str, source: str, installed: bool, state: str
 ) -> None:
-    monkeypatch.setattr("station.devices.ur.library_installed", lambda: installed)
+    monkeypatch.setattr("station.devices.ur.robot.library_installed", lambda: installed)
     rig.arm.control_path = path
     object.__setattr__(rig.session.context.cell, "source", source)
     found = await check(rig, "control")

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 from station.cell.errors import RobotError
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, RtdeError, RtdeLink, RuntimeState
-from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S, STOP_RAD_S2
+from station.devices.ur.moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S, STOP_RAD_S2
 
 SCRIPT_PORT = 30002
 FIRST_REGISTER = 24

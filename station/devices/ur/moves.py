@@ -16,7 +16,7 @@ from recordings.schema.messages import RobotState
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import RobotError
 from station.devices.news import MOVING_S
-from station.devices.ur_condition import control_ended
+from station.devices.ur.condition import control_ended
 
 ARRIVED_RAD = 0.01
 """Largest distance of a joint from its goal at which the move has arrived."""

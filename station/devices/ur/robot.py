@@ -23,14 +23,14 @@ from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
 from station.devices.base import fresh, ready
 from station.devices.news import CURRENT_S, RESTING_S, Delay
 from station.devices.rtde import RuntimeState
-from station.devices.ur_child import ControlChild
-from station.devices.ur_condition import arm_held, control_ended, foreign_program
-from station.devices.ur_dashboard import STOP, STOPPED, Dashboard, DashboardError, came
-from station.devices.ur_end_cause import cause_of_end
-from station.devices.ur_link import UrLink, link_lost
-from station.devices.ur_moves import MoveWatch, check_goal
-from station.devices.ur_probe import check_script_port
-from station.devices.ur_state import POLL_S
+from station.devices.ur.child import ControlChild
+from station.devices.ur.condition import arm_held, control_ended, foreign_program
+from station.devices.ur.dashboard import STOP, STOPPED, Dashboard, DashboardError, came
+from station.devices.ur.end_cause import cause_of_end
+from station.devices.ur.link import UrLink, link_lost
+from station.devices.ur.moves import MoveWatch, check_goal
+from station.devices.ur.probe import check_script_port
+from station.devices.ur.state import POLL_S
 
 log = logging.getLogger(__name__)
 

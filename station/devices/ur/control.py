@@ -1,7 +1,7 @@
-"""Control process of the arm, by ur_rtde or by the station's own script: `python -m …ur_control`.
+"""Control process of the arm, by ur_rtde or by the station's own script: `python -m …ur.control`.
 
 ur_rtde may hang, crash or abort, so it runs in this process, which can be killed. It is started by
-`ur_child`, answers requests on one inherited socket (one JSON object per message) and dies with its parent.
+`child`, answers requests on one inherited socket (one JSON object per message) and dies with its parent.
 It never reconnects, never uploads its script twice and never moves without a request.
 
 Requests: {"do": "beat", "ns": N}   N: host monotonic time of the session loop; resets the watchdog if fresh
@@ -122,7 +122,7 @@ class MotionServer:
 def open_control(path: str, host: str) -> Any:
     """Connect by ur_rtde or `ScriptControl`, which has the same calls. Raises RobotError, OSError."""
     if path == "script":
-        from station.devices.ur_script import ScriptControl
+        from station.devices.ur.script import ScriptControl
 
         return ScriptControl(host)
     try:

@@ -30,7 +30,7 @@ from station.cell.config import vector6
 from station.cell.errors import RobotError
 from station.cell.layout import pose_vector
 from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
-from station.devices.ur_state import Payload
+from station.devices.ur.state import Payload
 
 log = logging.getLogger(__name__)
 

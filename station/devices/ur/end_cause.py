@@ -16,10 +16,10 @@ from recordings.schema.messages import RobotState
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.news import RESTING_S, Evidence, longest_silence_s
 from station.devices.rtde import RuntimeState
-from station.devices.ur_child import ControlChild
-from station.devices.ur_condition import arm_held, program_ended
-from station.devices.ur_link import UrLink
-from station.devices.ur_state import POLL_S
+from station.devices.ur.child import ControlChild
+from station.devices.ur.condition import arm_held, program_ended
+from station.devices.ur.link import UrLink
+from station.devices.ur.state import POLL_S
 
 OUTLIVED_S = 0.6
 """If the control program still plays so long after a pause of this computer began, that pause did not stop

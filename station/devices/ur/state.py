@@ -20,7 +20,7 @@ from station.cell.errors import StaleStateError
 from station.devices.clocks import ClockEstimator, monotonic_from_wall_ns
 from station.devices.history import HISTORY_S
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, Recipe, RtdeError, RtdeLink
-from station.devices.ur_dashboard import connect_trouble
+from station.devices.ur.dashboard import connect_trouble
 
 SILENCE_S = 2.0
 """Time without data after which the connection is closed."""
@@ -56,7 +56,7 @@ class Payload(NamedTuple):
 class Sample(NamedTuple):
     state: RobotState
     operation: int
-    """Status word of asynchronous moves, see `ur_moves`."""
+    """Status word of asynchronous moves, see `moves`."""
     payload: Payload
 
 

@@ -24,17 +24,17 @@ from station.devices.history import state_at
 from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
 from station.devices.robot_lock import LOCKS, RobotLock
 from station.devices.rtde import RobotMode
-from station.devices.ur_condition import condition, not_powered, safety_stop
-from station.devices.ur_dashboard import Dashboard, DashboardError
-from station.devices.ur_probe import (
+from station.devices.ur.condition import condition, not_powered, safety_stop
+from station.devices.ur.dashboard import Dashboard, DashboardError
+from station.devices.ur.probe import (
     Found,
     check_script_port,
     identify,
     open_dashboard,
     unsupported_model,
 )
-from station.devices.ur_state import POLL_S, Payload, Sample, StateReader
-from station.devices.ur_tool import Installation, PrimaryReader, TcpCheck, check_payload
+from station.devices.ur.state import POLL_S, Payload, Sample, StateReader
+from station.devices.ur.tool import Installation, PrimaryReader, TcpCheck, check_payload
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from recordings.errors import ErrorData
 from station.cell.child import open_log
 from station.cell.errors import RobotError, StaleStateError
 from station.devices.news import Delay
-from station.devices.ur_moves import STOP_RAD_S2
+from station.devices.ur.moves import STOP_RAD_S2
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -40,7 +40,7 @@ KEPT = 64
 
 
 class _Answer(msgspec.Struct):
-    """Message of the control process (`ur_control`), or the news of its death."""
+    """Message of the control process (`control`), or the news of its death."""
 
     tcp: tuple[float, ...] | None = None
     refused: ErrorData | None = None
@@ -94,7 +94,7 @@ class ControlChild:
         Raises RobotError when it cannot be started.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        command = [sys.executable, "-m", "station.devices.ur_control", path, host, str(theirs.fileno())]
+        command = [sys.executable, "-m", "station.devices.ur.control", path, host, str(theirs.fileno())]
         try:
             with theirs, open_log(log_path) as log:
                 process = subprocess.Popen(

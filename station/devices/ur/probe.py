@@ -12,7 +12,7 @@ from calibrate.kinematics import MODELS
 from station.cell.errors import RobotError
 from station.devices.rtde import PORT as RTDE_PORT
 from station.devices.rtde import RtdeError, RtdeLink
-from station.devices.ur_dashboard import Dashboard, DashboardError, connect_trouble
+from station.devices.ur.dashboard import Dashboard, DashboardError, connect_trouble
 
 SCRIPT_PORT = 30002
 POLYSCOPE_X = 10

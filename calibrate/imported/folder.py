@@ -139,10 +139,17 @@ def believe(
         if any(same_pictures(each.paths, other.paths) for other, _ in good):
             continue
         if (sizes := _sizes(each.paths)) is not None:
-            problem = ImportSourceError("image-sizes", source=held.root, images=each.family, sizes=sizes)
+            problem = problem or ImportSourceError(
+                "image-sizes", source=held.root, images=each.family, sizes=sizes
+            )
             continue
         readings: list[TableReading] = []
-        if (seen := see_board(held, given.board, each.paths, progress)) is not None:
+        try:
+            seen = see_board(held, given.board, each.paths, progress)
+        except ImportSourceError as unreadable:  # others may be pictures: maps of depths lie beside them
+            problem = problem or unreadable
+            continue
+        if seen is not None:
             board_seen = True
             for table, pairs in each.rows:
                 readings += table_readings(table, each.family, pairs, [seen], given.convention)
@@ -154,7 +161,7 @@ def believe(
             raise _several(held, [(other.family, _row_names(other)) for other in rivals])
     if good:
         tried = good[0][1]
-    elif problem is not None:
+    elif problem is not None and not tried:
         raise problem
     elif not (sets and (given.board or given.images)):
         pair_readings = _pair_readings(held, robots, given, progress)

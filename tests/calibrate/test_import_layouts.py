@@ -531,6 +531,21 @@ def test_two_sizes_are_said(shots: Shots, tmp_path: Path) -> None:
     assert "480×384" in sizes and "960×768" in sizes and paths[3].name in sizes
 
 
+def test_maps_of_depths_beside_the_pictures_are_no_pictures(shots: Shots, tmp_path: Path) -> None:
+    for n, path in enumerate(save_images(shots, tmp_path, "pos{n}.png")):
+        cv2.imwrite(str(path.with_name(f"cloud{n}.tiff")), np.zeros((384, 480), np.float32))
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    assert require_right(shots, tmp_path) == {"one"}
+
+
+def test_maps_of_depths_alone_are_told(shots: Shots, tmp_path: Path) -> None:
+    for n in range(VIEWS):
+        cv2.imwrite(str(tmp_path / f"cloud{n}.tiff"), np.zeros((384, 480), np.float32))
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    with raises("bad-image"):
+        believe(look(tmp_path), GIVEN)
+
+
 OPENCV = """%YAML:1.0
 ---
 translation: !!opencv-matrix

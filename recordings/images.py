@@ -42,7 +42,7 @@ def decode_image(data: bytes, width: int, height: int) -> Pixels:
     if decoded.ndim == 3 and decoded.dtype == np.uint16:
         return np.asarray(np.right_shift(decoded, 8), np.uint8)
     if decoded.dtype not in (np.uint8, np.uint16):
-        raise ImageError(f"holds {decoded.dtype} numbers, as a map of depths does; a picture has 8 or 16 bits")
+        raise ImageError(f"holds {decoded.dtype}, as a map of depths does; a picture has 8 or 16 bits")
     return decoded
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import signal
 import statistics
@@ -21,7 +22,7 @@ from pathlib import Path
 from benchmarks.trials import trials
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
-from station.devices.base import ready
+from station.devices.base import wait_for_state
 from station.devices.news import Delay
 from station.devices.ur import UrRobot
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
@@ -129,7 +130,7 @@ async def at_rest(made: Rig, fault: Fault, late_s: float) -> tuple[str, str]:
     await asyncio.sleep(min(0.11, late_s / 2))
     said = "waited"
     try:
-        await ready(made.robot)
+        await wait_for_state(made.robot, checked=True)
     except RobotError as error:
         said = f"fault: {error.code}"
     await faulty
@@ -142,7 +143,7 @@ async def at_rest(made: Rig, fault: Fault, late_s: float) -> tuple[str, str]:
 async def moving(made: Rig, fault: Fault, late_s: float) -> tuple[str, float]:
     """What ended the move, '' for nothing, and when the arm rested after its news ended, seconds."""
     await made.start()
-    joints = list(made.robot.newest().state.joints_rad)
+    joints = list(made.robot.sample(math.inf, connected=False).state.joints_rad)
     joints[0] += FAR_RAD if joints[0] < 0 else -FAR_RAD
     move = asyncio.create_task(made.robot.move(joints, 0.5, 1.0))
     while not move.done() and await asyncio.to_thread(made.speed_rad_s) < 0.4:

@@ -137,7 +137,7 @@ class StillnessMonitor:
         look: Callable[[int], float | None] = lambda since_ns: math.nan,
         now_s: Callable[[], float] = time.monotonic,
     ) -> Stillness:
-        """Wait until everything is at rest. `alive`: the robot's `check`; None: its states are late.
+        """Wait until everything is at rest. `alive`: looks at the arm; None: its states are late.
 
         `look`: returns the motion (px) in images exposed since a host time, that of the joints' rest; NaN
         where it cannot be measured, None: not yet.

@@ -1,16 +1,11 @@
 """Protocols that real, simulated and played-back devices implement, and the worker thread of a driver.
 
-Where is the arm now? How late a state may be is the rule of `devices.news`.
+Where is the arm now? `arm.state()` says it or raises. Its argument is the largest age that the state may
+have; without it only the present state will do. A late state may be waited for while `arm.overdue()` has
+nothing against it (the rule is in `devices.news`): `await wait_for_state(arm)` waits, `look_at(arm)` looks
+once, for loops that look again soon. Both can ask `arm.check(state)`, too: may the arm be captured in it?
 
-    await fresh(arm)    waits for a current state: whoever decides something by it
-    await ready(arm)    as `fresh`, and the arm is one that may be captured: sessions, by `ready_state`
-    arm.news()          does not wait, None while the state is late: loops that look again soon
-    arm.check()         as `news`, and may be captured: the loop that waits for rest
-    arm.latest()        does not wait, an error over 100 ms: to show it
-    arm.at(time)        the state at an image's exposure
-
-The driver of Universal Robots has two of its own: `newest`, which may be old, to judge a move that is watched
-by `news`, and `state_after`, for what happened after a moment.
+Where was it at an image's exposure? `arm.at(time)`.
 """
 
 from __future__ import annotations
@@ -26,6 +21,7 @@ from station.cell.arm_acceptance import StopWay
 from station.cell.clock_fit import ClockFit
 from station.cell.errors import StaleStateError
 from station.cell.status import ArmCondition, CameraCounts, FrameTiming
+from station.devices.news import CURRENT_S
 
 T = TypeVar("T")
 
@@ -76,12 +72,17 @@ class Arm(Protocol):
     guided: bool
     """True while a person moves the arm by hand: states may then be late by `MOVING_S` only."""
 
-    def latest(self) -> RobotState:
-        """Return the newest state; StaleStateError when it is older than 100 ms."""
+    def state(self, largest_age_s: float = CURRENT_S) -> RobotState:
+        """Return the newest state, without waiting. StaleStateError where it is older than `largest_age_s`.
 
-    def news(self) -> RobotState | None:
-        """Return the newest state; None while it is late. StaleStateError after `MOVING_S` in motion,
-        `RESTING_S` at rest (`devices.news`)."""
+        Its age is the time since it arrived, by this computer's monotonic clock.
+        """
+
+    def overdue(self) -> StaleStateError | None:
+        """Name why a late state is waited for no longer; None: it may still come, or it is there.
+
+        It may come within `MOVING_S` in motion, `RESTING_S` at rest (`devices.news`).
+        """
 
     def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
         """Name what made states late since `since_s` (host monotonic), by `devices.news`; None: nothing did.
@@ -89,8 +90,11 @@ class Arm(Protocol):
         `pause_s`: how long this computer was busy.
         """
 
-    def check(self) -> RobotState | None:
-        """Return `news`; RobotError where nothing may be captured, as after a safety stop or TCP change."""
+    def check(self, state: RobotState) -> bool:
+        """Tell whether the arm may be captured in its present state; False: that is not known yet.
+
+        RobotError where nothing may be captured, as after a safety stop or TCP change.
+        """
 
     @property
     def identity(self) -> RobotIdentity: ...
@@ -166,21 +170,28 @@ class Mover(Protocol):
         """Stop the control program and end its process."""
 
 
-NEWS_POLL_S = 0.005
+STATE_POLL_S = 0.005
 
 
-async def fresh(arm: Arm) -> RobotState:
-    """Wait for a current state of the arm and return it. StaleStateError when none comes."""
-    while (state := arm.news()) is None:
-        await asyncio.sleep(NEWS_POLL_S)
+async def wait_for_state(arm: Arm, *, checked: bool = False) -> RobotState:
+    """Wait for the present state of the arm and return it. StaleStateError when none comes (`Arm.overdue`).
+
+    `checked`: the arm must be one that may be captured; RobotError where nothing may be (`Arm.check`).
+    """
+    while (state := look_at(arm, checked=checked)) is None:
+        await asyncio.sleep(STATE_POLL_S)
     return state
 
 
-async def ready(arm: Arm) -> RobotState:
-    """Wait as `fresh` does; RobotError where nothing may be captured now (see `Arm.check`)."""
-    while (state := arm.check()) is None:
-        await asyncio.sleep(NEWS_POLL_S)
-    return state
+def look_at(arm: Arm, *, checked: bool = False) -> RobotState | None:
+    """Return what `wait_for_state` waits for, or None while it may still come. The same errors."""
+    try:
+        state = arm.state()
+    except StaleStateError:
+        if (overdue := arm.overdue()) is not None:
+            raise overdue from None
+        return None
+    return state if not checked or arm.check(state) else None
 
 
 class Camera(Protocol):

@@ -36,6 +36,7 @@ from station.cell.layout import pose_vector
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import ArmCondition, CameraCounts, FrameTiming
 from station.devices.cell import Cell
+from station.devices.news import CURRENT_S
 
 STATE_RATE_HZ = 100.0
 MOVE_S = 0.2
@@ -140,7 +141,7 @@ class PlaybackRobot:
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
         self._callbacks.append(callback)
 
-    def latest(self) -> RobotState:
+    def state(self, largest_age_s: float = CURRENT_S) -> RobotState:
         return self.at(time.monotonic_ns())
 
     def at(self, host_monotonic_ns: int) -> RobotState:
@@ -175,11 +176,11 @@ class PlaybackRobot:
     def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
         return None
 
-    def news(self) -> RobotState | None:
-        return self.latest()
+    def overdue(self) -> StaleStateError | None:
+        return None
 
-    def check(self) -> RobotState | None:
-        return self.latest()
+    def check(self, state: RobotState) -> bool:
+        return True
 
     async def may_start(self) -> None:
         return
@@ -226,7 +227,7 @@ class PlaybackRobot:
 
     async def _publish(self) -> None:
         while True:
-            state = self.latest()
+            state = self.state()
             for callback in self._callbacks:
                 callback(state)
             await asyncio.sleep(1 / STATE_RATE_HZ)

@@ -123,25 +123,31 @@ class PostedArm:
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
         self._callbacks.append(callback)
 
-    def latest(self) -> RobotState:
-        if (state := self.news()) is None:
-            raise self._silent()
-        return state
-
-    def news(self) -> RobotState | None:
+    def state(self, largest_age_s: float = CURRENT_S) -> RobotState:
+        """Return the newest pose; one of a program that posts as rarely as it may is the present one."""
         if time.monotonic() > self._notice_since_s + NOTICE_S:
             self.notice = ""
-        if self._wrong is not None and time.monotonic() < self._wrong_since_s + AFTER_WRONG_S:
-            raise self._wrong
-        if not self._poster or not self._states:
-            raise StaleStateError("post-nobody", robot=self.identity.model, socket=self.path)
-        age_s = self._age_s()
-        if age_s > max(RESTING_S, self._current_s):
+        if (trouble := self._trouble()) is not None:
+            raise trouble
+        if self._age_s() > max(largest_age_s, self._current_s):
             raise self._silent()
-        return self._states[-1] if age_s <= self._current_s else None
+        return self._states[-1]
 
-    def check(self) -> RobotState | None:
-        return self.news()
+    def overdue(self) -> StaleStateError | None:
+        if (trouble := self._trouble()) is not None:
+            return trouble
+        return self._silent() if self._age_s() > max(RESTING_S, self._current_s) else None
+
+    def _trouble(self) -> StaleStateError | None:
+        """Name a wrong post, or that nobody posts; None: poses come, or came."""
+        if self._wrong is not None and time.monotonic() < self._wrong_since_s + AFTER_WRONG_S:
+            return self._wrong
+        if not self._poster or not self._states:
+            return StaleStateError("post-nobody", robot=self.identity.model, socket=self.path)
+        return None
+
+    def check(self, state: RobotState) -> bool:
+        return True
 
     def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
         return None

@@ -146,14 +146,14 @@ class CellSetup:
         if step is not CellStep.VIEWS or draft.mount is None or self.arm is None:
             return False
         if self.guide is None:
-            self.guide = HandGuide(self.arm.latest, self._stillness)
+            self.guide = HandGuide(self.arm.state, self._stillness)
             self.arm.guided = True  # also: from the first view on no other TCP offset is taken
         arm, guide, blank = self.arm, self.guide, CameraModel(draft.width, draft.height)
         cell = (draft.mount, draft.board, blank, False)
         self.guidance = await guide.look(cell, draft.views, image, seen)
         if not guide.take or self.draft is not draft or self._stillness.moved_ns >= begun_ns:
             return False
-        flange = np.array(flange_pose(arm.latest(), arm.identity.tcp_offset))
+        flange = np.array(flange_pose(arm.state(), arm.identity.tcp_offset))
         view = CapturedView(len(draft.views), flange, seen.indices, seen.pixels)
         self.change(views=(*draft.views, view))
         guide.taken(True)

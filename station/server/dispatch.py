@@ -48,7 +48,7 @@ class SessionDispatcher:
         """
         cell = self._session.context.cell
         try:
-            state = cell.arm.latest()
+            state = cell.arm.state()
         except RobotError:
             return ArmMotion.UNKNOWN
         if not state.joint_speeds_rad_s:

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import math
 import time
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.layout import flange_pose
 from station.cell.status import StationState
+from station.devices.base import look_at
 from station.devices.news import RESTING_S
 from station.session.context import SessionContext
 from station.session.recording import to_the_end
@@ -47,7 +49,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int, unchecked
     """
     _enter(context, index, StationState.SETTLING)
     async with ImageWatch(context, index) as watch:
-        still = await context.stillness.settle(context.cell.arm.check, watch.look)
+        still = await context.stillness.settle(partial(look_at, context.cell.arm, checked=True), watch.look)
     _enter(context, index, StationState.CAPTURING)
     image = context.require_recording().number(await take_image(context, index))
     state, bound_s = await at_exposure(context, image)

@@ -41,7 +41,7 @@ async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[C
 async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> list[Check]:
     arm, host = context.cell.arm, context.cell.config.robot.host
     try:
-        state = arm.latest()
+        state = arm.state()
     except RobotError as error:
         told = context.cell.mover is None  # its error says it all
         remedy = "" if told else "check that it is on, its network cable, and robot.host"

@@ -22,7 +22,7 @@ from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionState
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
-from station.devices.base import ready
+from station.devices.base import wait_for_state
 from station.devices.cell import Cell
 from station.protocol.states import LATCHED, check_transition
 from station.session.queue import PoseQueue
@@ -82,7 +82,7 @@ class SessionContext:
 
     async def ready_state(self) -> RobotState:
         """Wait for a current state of an arm that may be captured, and return it. Raises RobotError."""
-        return await ready(self.cell.arm)
+        return await wait_for_state(self.cell.arm, checked=True)
 
     @property
     def recorder(self) -> Recorder | None:

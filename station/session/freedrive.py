@@ -16,7 +16,7 @@ from station.cell.errors import RefusedError, StaleStateError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import GuidanceStatus, StationState
 from station.cell.stillness import NotStillError
-from station.devices.base import fresh
+from station.devices.base import wait_for_state
 from station.protocol.verbs import Freedrive, Record
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
@@ -93,7 +93,7 @@ class FreedriveCapture:
         await look_back(context)
         Freedrive.require(store.state)  # STOP may have come in between
         context.requests.halt = False
-        self.guide = HandGuide(context.cell.arm.latest, context.stillness, context.workers.call)
+        self.guide = HandGuide(context.cell.arm.state, context.stillness, context.workers.call)
         # Enter the state at once: while the file is opened no motion is offered and no image begun.
         store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
         async with self._taking:
@@ -168,7 +168,7 @@ class FreedriveCapture:
     async def _record(self, asked: bool) -> int:
         context = self._context
         queue, store = context.loaded(), context.store
-        joints = (await fresh(context.cell.arm)).joints_rad
+        joints = (await wait_for_state(context.cell.arm)).joints_rad
         Record.require(store.state)  # STOP, or the end of freedrive, may have come in between
         index = queue.add(
             PlannedPose(f"hand-{len(queue.statuses) + 1:02d}", joints, why="guided by hand", guided=True)

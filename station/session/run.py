@@ -16,7 +16,7 @@ from station.cell.layout import cell_geometry
 from station.cell.limits import check_path, with_plan_speeds
 from station.cell.status import Event, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError
-from station.devices.base import fresh
+from station.devices.base import wait_for_state
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
 from station.session.ending import failed, seal
@@ -69,7 +69,8 @@ class Run:
                 # Save the poses before anything moves, so that a restart finds them.
                 await context.recording.save_state(self._queue)
             await self._mover.start_control()
-            here = (await fresh(context.cell.arm)).joints_rad  # starting control takes a second or two
+            # Starting control takes a second or two.
+            here = (await wait_for_state(context.cell.arm)).joints_rad
             require_start(here, self._go.start_joints_rad, "while control was started")
             if self._go.motion.stop_test is None:
                 await self._open_recording()

@@ -22,7 +22,7 @@ from station.cell.pose_plan import Plan
 from station.cell.session_folder import interrupted_session
 from station.cell.status import LeaseStatus, MotionPreview, SessionStatus, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
-from station.devices.base import fresh
+from station.devices.base import wait_for_state
 from station.devices.cell import Cell
 from station.plan.choose import CRITERIA
 from station.plan.planner import make_plan
@@ -222,7 +222,7 @@ class Session:
         self.require_latched()
         stops = self._stops
         try:
-            await fresh(self.context.cell.arm)
+            await wait_for_state(self.context.cell.arm)
             resting = self.context.resting
         except RobotError:
             resting = StationState.DISCONNECTED
@@ -273,7 +273,7 @@ class Session:
         """
         context = self.context
         self.permit(verbs.Go, client_id)
-        joints = (await fresh(context.cell.arm)).joints_rad
+        joints = (await wait_for_state(context.cell.arm)).joints_rad
         self.permit(verbs.Go, client_id)
         self._require_run_ended()
         if self.freedrive.taking:
@@ -365,7 +365,7 @@ class Session:
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
         try:
-            start = (await fresh(self.context.cell.arm)).joints_rad
+            start = (await wait_for_state(self.context.cell.arm)).joints_rad
         except RobotError:
             start = None
         self.store.event("planning", f"planning {wanted.poses} poses", poses=wanted.poses)

@@ -136,7 +136,7 @@ async def _give_stop(
     start, turn_rad = start_rad[test.joint], test.target_rad - start_rad[test.joint]
     while not driving.done():
         with contextlib.suppress(StaleStateError):  # the move itself reports states that are too old
-            if abs(arm.latest().joints_rad[test.joint] - start) >= _MIDDLE * abs(turn_rad):
+            if abs(arm.state().joints_rad[test.joint] - start) >= _MIDDLE * abs(turn_rad):
                 break
         await asyncio.sleep(_LOOK_S)
     else:

@@ -15,11 +15,13 @@ from collections.abc import Callable
 
 import msgspec
 
+from recordings.schema.messages import RobotState
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.cell.layout import cell_geometry
 from station.cell.limits import point_speed_m_s
 from station.cell.status import CameraStatus, RecorderStatus, RobotStatus, StationState, TriggerStatus
+from station.devices.base import look_at
 from station.devices.news import CURRENT_S, REPORTED_S, Delay
 from station.protocol.states import RUNNING
 from station.session.context import SessionContext
@@ -69,7 +71,7 @@ class Monitor:
             notice=arm.notice,
         )
         try:
-            state = arm.latest()
+            state = arm.state()
         except RobotError:
             return shown
         speed_m_s = 0.0
@@ -162,9 +164,7 @@ class SessionSupervisor:
         """Switch between idle and disconnected; during a run the run itself detects a lost robot."""
         store, arm = self._context.store, self._context.cell.arm
         try:
-            if arm.news() is None:
-                self._late_since_s = self._late_since_s or time.monotonic()
-                return
+            state = look_at(arm)
         except StaleStateError as error:
             if not self._lost_code:
                 self._void_approvals()
@@ -177,8 +177,11 @@ class SessionSupervisor:
             elif new and store.state is StationState.FREE_DRIVE:
                 store.problem(error)
             return
+        if state is None:
+            self._late_since_s = self._late_since_s or time.monotonic()
+            return
         self._lost_code = ""
-        self._watch_safety()
+        self._watch_safety(state)
         if self._late_since_s:
             self._report_delay(self._late_since_s)
             self._late_since_s = 0.0
@@ -186,7 +189,7 @@ class SessionSupervisor:
             store.enter(self._context.resting)
             store.event("robot-connected", "robot connected")
 
-    def _watch_safety(self) -> None:
+    def _watch_safety(self, state: RobotState) -> None:
         """Bar services when the controller's safety stops an arm that rests.
 
         In a run the run itself ends as `stopped`.
@@ -195,7 +198,7 @@ class SessionSupervisor:
         if cell.mover is None:
             return
         try:
-            cell.arm.check()
+            cell.arm.check(state)
         except SafetyStopError as error:
             self._safety_stopped = True
             if not before:

@@ -127,7 +127,7 @@ def _posted_cell(config: StationConfig, path: str, folder: Path, control: Path, 
     arm = PostedArm(config, "simulated", control)
 
     def flange() -> Array:
-        return flange_pose(arm.latest(), arm.identity.tcp_offset)
+        return flange_pose(arm.state(), arm.identity.tcp_offset)
 
     folder.mkdir(parents=True, exist_ok=True)
     attachments = {TRUTH: write_truth(truth, folder / TRUTH)}

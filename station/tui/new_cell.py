@@ -242,7 +242,7 @@ class NewCell(LivePageApp[Ending]):
     def action_table_here(self) -> None:
         with self._problems():
             if self.setup.arm is not None:
-                self.setup.change(table_m=float(self.setup.arm.latest().tcp_pose[2]))
+                self.setup.change(table_m=float(self.setup.arm.state().tcp_pose[2]))
                 self.watch_step()
 
     # --- what is shown ---

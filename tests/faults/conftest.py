@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
+import math
 import os
 import signal
 import time
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from recordings.schema.messages import RobotState
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, StaleStateError
 from station.devices.news import Delay
@@ -79,10 +81,14 @@ class Cell:
     async def told(self) -> None:
         """What was done before has reached the driver."""
         done_s = (await self.ask("state"))["timestamp_s"]
-        await until(lambda: (self.robot.newest().state.stamps.controller_s or 0.0) > done_s)
+        await until(lambda: (self.seen().stamps.controller_s or 0.0) > done_s)
+
+    def seen(self) -> RobotState:
+        """The newest state that reached the driver, however old."""
+        return self.robot.sample(math.inf, connected=False).state
 
     def near(self, joint: int = 5, by_rad: float = 0.02) -> list[float]:
-        goal = list(self.robot.newest().state.joints_rad)
+        goal = list(self.seen().joints_rad)
         goal[joint] += by_rad
         return goal
 
@@ -120,8 +126,9 @@ class Cell:
     async def cruising(self) -> asyncio.Task[None]:
         """A move that has reached its full speed."""
         while True:
-            move, goal = self.far_move(), self.robot.newest().state.joints_rad[0] + FAR_RAD
-            while not move.done() and self.robot.newest().state.joint_speeds_rad_s[0] < 0.4:
+            goal = self.seen().joints_rad[0] + FAR_RAD
+            move = self.far_move()
+            while not move.done() and self.seen().joint_speeds_rad_s[0] < 0.4:
                 await asyncio.sleep(POLL_S)
             if not move.done():
                 return move

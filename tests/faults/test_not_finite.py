@@ -27,7 +27,7 @@ OUTPUTS = ["timestamp", "actual_q", "actual_qd", "target_q", "actual_TCP_pose", 
 def told(robot: UrRobot) -> str:
     """Name what is wrong with the arm's news; empty: nothing."""
     try:
-        robot.latest()
+        robot.state()
     except StaleStateError as error:
         return error.code
     return ""
@@ -41,19 +41,19 @@ async def test_in_mid_move_they_stop_the_arm_and_are_named(cell: MakeCell, outpu
     assert told(c.robot) == "state-not-finite"
     await c.ask("spoil", outputs=[])
     await until(lambda: not told(c.robot))
-    assert math.isfinite(fastest_rad_s(c.robot.latest()))
+    assert math.isfinite(fastest_rad_s(c.robot.state()))
 
 
 async def test_at_rest_they_are_no_news_and_end_as_they_began(cell: MakeCell) -> None:
     c = await cell(control=False)
-    before = c.robot.latest().joints_rad
+    before = c.robot.state().joints_rad
     seen: list[float] = []
     c.robot.subscribe(lambda state: seen.extend(state.joints_rad))
     await c.ask("spoil", outputs=["actual_q"])
     await until(lambda: told(c.robot) == "state-not-finite")
     await c.ask("spoil", outputs=[])
     await until(lambda: not told(c.robot))
-    assert c.robot.latest().joints_rad == pytest.approx(before)
+    assert c.robot.state().joints_rad == pytest.approx(before)
     assert all(map(math.isfinite, seen))
 
 

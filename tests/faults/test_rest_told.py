@@ -31,7 +31,7 @@ CREPT_RAD = 5e-5
 def rests(robot: UrRobot) -> bool:
     """Tell whether the newest state says that the arm rests, as the daemon decides it after STOP."""
     try:
-        state = robot.latest()
+        state = robot.state()
     except RobotError:
         return False
     return fastest_rad_s(state) <= RESTING_RAD_S and robot.after_stop(state)

@@ -42,7 +42,7 @@ def robot_at(host: str, folder: Path, **config: Any) -> UrRobot:
 
 def complaint(robot: UrRobot) -> ErrorData | None:
     try:
-        robot.check()
+        robot.check(robot.state())
     except RobotError as error:
         return error.data
     return None
@@ -176,10 +176,10 @@ async def test_old_news_is_not_taken_for_new(cell: MakeCell, fault: dict[str, An
     await c.ask(**fault)
     await asyncio.sleep(0.15)
     with pytest.raises(StaleStateError):
-        c.robot.latest()
+        c.robot.state()
     await c.ask(**fault, on=False)
     await until(lambda: c.robot.age_s() < 0.05)
-    c.robot.latest()
+    c.robot.state()
 
 
 async def test_the_link_comes_back_by_itself_but_control_does_not(cell: MakeCell) -> None:
@@ -204,7 +204,7 @@ CHANGES: dict[str, tuple[Any, Any]] = {
 @pytest.mark.parametrize("code", CHANGES)
 async def test_tcp_or_payload_changed_on_the_pendant(cell: MakeCell, code: str) -> None:
     c, (change, back) = await cell(), CHANGES[code]
-    c.robot.check()
+    c.robot.check(c.robot.state())
     await c.ask(**change)
     await until(lambda: (told := complaint(c.robot)) is not None and told.code == code)
     told = complaint(c.robot)
@@ -239,7 +239,7 @@ async def test_safety_stop_between_moves_ends_control(cell: MakeCell) -> None:
     await c.ask("estop")
     await until(lambda: not c.robot.control)
     with raises("emergency-stop"):
-        c.robot.check()
+        c.robot.check(c.robot.state())
 
 
 async def test_a_daemon_that_died_leaves_no_lock(arm: SimulatedController, tmp_path: Path) -> None:

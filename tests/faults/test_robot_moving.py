@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
-from station.devices.base import ready
+from station.devices.base import wait_for_state
 from station.devices.news import Delay
 from station.devices.ur import UrRobot
 from station.devices.ur.child import ControlChild
@@ -191,9 +191,9 @@ async def test_control_that_ended_between_two_moves_is_no_trouble_once_it_was_to
     os.kill(control_pid, signal.SIGSTOP)
     await until(lambda: c.robot._ended_by is not None)
     with pytest.raises(RobotError):
-        await ready(c.robot)
+        await wait_for_state(c.robot, checked=True)
     await c.robot.end_control()
-    await ready(c.robot)
+    await wait_for_state(c.robot, checked=True)
     await c.begin()
 
 

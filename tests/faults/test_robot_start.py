@@ -41,7 +41,7 @@ async def gone(c: Cell) -> None:
 def is_well(robot: UrRobot) -> bool:
     """The link is back, the dashboard's too."""
     with suppress(RobotError):
-        robot.check()
+        robot.check(robot.state())
         return robot.connected
     return False
 

@@ -30,7 +30,7 @@ from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.cell.status import ArmCondition, CameraCounts, DetectionStatus, Event, FrameTiming, StationState
 from station.devices.cell import Cell
-from station.devices.news import Evidence
+from station.devices.news import CURRENT_S, Evidence
 from station.devices.ur import control_trouble
 from station.devices.ur.condition import condition
 from station.protocol.verbs import Purpose
@@ -97,14 +97,14 @@ class ArmInMemory:
             robot_status_bits=1,
         )
 
-    def latest(self) -> RobotState:
+    def state(self, largest_age_s: float = CURRENT_S) -> RobotState:
         if self.late or self.lost:
             raise StaleStateError()
         return self._state()
 
     def at(self, host_monotonic_ns: int) -> RobotState:
         stamps = Stamps(host_monotonic_ns, time.time_ns(), self._controller_s)
-        return msgspec.structs.replace(self.latest(), stamps=stamps)
+        return msgspec.structs.replace(self.state(), stamps=stamps)
 
     def clock(self) -> None:
         return None
@@ -112,13 +112,13 @@ class ArmInMemory:
     def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
         return Evidence(pause_s, self.gap_s, 0.0, loopback=True).error("")
 
-    def news(self) -> RobotState | None:
-        return None if self.late else self.latest()
+    def overdue(self) -> StaleStateError | None:
+        return StaleStateError() if self.lost and not self.late else None
 
-    def check(self) -> RobotState | None:
+    def check(self, state: RobotState) -> bool:
         if self.trouble is not None:
             raise self.trouble
-        return self.news()
+        return True
 
     async def may_start(self) -> None:
         return

@@ -37,7 +37,7 @@ class GuidedArm(UrLink):
     def trouble(self) -> str:
         """Why the arm cannot be guided now, and what to do on the pendant; empty: nothing."""
         try:
-            return self.condition(self.latest()).held
+            return self.condition(self.state()).held
         except RobotError as problem:
             return str(problem)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -53,8 +54,10 @@ class UrLink:
         """Whether remote control is on; None where there is no such switch (CB3)."""
         self.reader: StateReader | None = None
         """Reader of the state stream, with its counters; a new one after a lost connection."""
+        self._newest: Sample | None = None
+        """The newest sample, of this connection or an earlier one; None: none."""
         self._arrived_ns = 0
-        """Arrival of the newest state, of this connection or an earlier one (host monotonic); 0: none."""
+        """Its arrival (host monotonic); 0: none."""
         self.guided = False
         """True while a person moves the arm by hand."""
         self.dashboard: Dashboard | None = None
@@ -148,7 +151,7 @@ class UrLink:
         told = self._primary.installation if self._primary is not None else Installation()
         if told.tcp_offset is None or self._tool is None or self._tool.stated or self._relied_on:
             return
-        self._tool = self._tool_of(self.latest(), told)
+        self._tool = self._tool_of(self.state(), told)
         self.identity = msgspec.structs.replace(self.identity, tcp_offset=self._tool.offset)
 
     async def close(self) -> None:
@@ -160,7 +163,7 @@ class UrLink:
         await self._close_link()
         self._unlock()
         self._tool, self._payload, self._relied_on = None, None, False
-        self._arrived_ns = 0
+        self._newest, self._arrived_ns = None, 0
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -184,6 +187,8 @@ class UrLink:
 
     def _deliver(self, state: RobotState) -> None:
         before_ns, self._arrived_ns = self._arrived_ns, state.stamps.host_monotonic_ns
+        if self.reader is not None:
+            self._newest = self.reader.newest
         if self._arrived_ns - before_ns > CURRENT_S * 1e9:
             self._trouble_since_s = time.monotonic()  # what delayed the states delayed all else, too
         for callback in self._subscribers:
@@ -199,15 +204,8 @@ class UrLink:
 
     @property
     def connected(self) -> bool:
-        """True while the state stream is connected; how current its news are, tells `latest`."""
+        """True while the state stream is connected; how old its newest state is, tells `age_s`."""
         return self.reader is not None and self.reader.ended is None and self.reader.newest is not None
-
-    def newest(self) -> Sample:
-        """Return the last sample, however old. StaleStateError when none ever came."""
-        sample = self.reader.newest if self.reader is not None else None
-        if sample is None:
-            raise not_connected(self.config.host)
-        return sample
 
     @property
     def in_motion(self) -> bool:
@@ -226,24 +224,27 @@ class UrLink:
     def _age_s(self) -> float:
         return (time.monotonic_ns() - self._arrived_ns) / 1e9 if self._arrived_ns else float("inf")
 
-    def latest(self) -> RobotState:
-        """Return the newest state; StaleStateError when over 100 ms old, or if its controller time stands."""
-        age_s = self.age_s()
-        if age_s > CURRENT_S or not self.connected:
-            raise self.stale(age_s, CURRENT_S)
-        return self.newest().state
+    def sample(self, largest_age_s: float = CURRENT_S, *, connected: bool = True) -> Sample:
+        """Return the newest sample; StaleStateError where it is older, or its controller time stands as long.
 
-    def news(self) -> RobotState | None:
-        """Return the newest state; None while it is late, within the limit for rest or motion.
-
-        StaleStateError beyond the limit, and at once when the connection to an arm in motion ended.
+        `connected`: the connection must live; False: a sample of one that ended will do, too.
         """
         age_s = self.age_s()
-        if age_s <= CURRENT_S and self.connected:
-            return self.newest().state
+        if self._newest is None or age_s > largest_age_s or (connected and not self.connected):
+            raise self.stale(age_s, largest_age_s)
+        return self._newest
+
+    def state(self, largest_age_s: float = CURRENT_S) -> RobotState:
+        return self.sample(largest_age_s).state
+
+    def overdue(self) -> StaleStateError | None:
+        """Name why a late state is waited for no longer: at once where the connection of an arm in motion
+        ended."""
         limit_s = MOVING_S if self.in_motion else RESTING_S
-        if age_s > limit_s or (self.in_motion and not self.connected):
-            raise self.stale(age_s, limit_s)
+        try:
+            self.sample(limit_s, connected=self.in_motion)
+        except StaleStateError as error:
+            return error
         return None
 
     def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
@@ -284,11 +285,10 @@ class UrLink:
         return self.reader.history.copy() if self.reader is not None else ()
 
     async def state_after(self, moment_s: float, wait_s: float) -> RobotState | None:
-        """Wait for the first state after a moment (host monotonic); None: none within `wait_s` of it."""
+        """Wait for a state younger than a moment (host monotonic); None: none within `wait_s` of it."""
         while time.monotonic() < moment_s + wait_s:
-            sample = self.reader.newest if self.reader is not None else None
-            if sample is not None and sample.state.stamps.host_monotonic_ns > moment_s * 1e9:
-                return sample.state
+            with contextlib.suppress(StaleStateError):
+                return self.sample(time.monotonic() - moment_s, connected=False).state
             await asyncio.sleep(POLL_S)
         return None
 
@@ -301,21 +301,18 @@ class UrLink:
         """Return the controller's clock against the host's; None before there are enough samples."""
         return self.reader.clock.fit() if self.reader is not None else None
 
-    def check(self) -> RobotState | None:
-        """Return `news`; RobotError where nothing may be captured, as after a safety stop or TCP change."""
-        state = self.news()
-        if state is None:
-            return None
+    def check(self, state: RobotState) -> bool:
+        """Tell whether the arm may be captured; False while a dashboard at rest is being asked again."""
         stop = safety_stop(state)
         if stop is not None:
             raise stop
-        self.check_tool(self.newest())
+        self.check_tool(self.sample(math.inf, connected=False))
         if self._trouble is not None:
             recent = time.monotonic() - self._trouble_since_s <= RESTING_S
             if self._trouble.code == DashboardError.code and recent and not self.in_motion:
-                return None
+                return False
             raise self._trouble
-        return state
+        return True
 
     def condition(self, state: RobotState) -> ArmCondition:
         return condition(state)

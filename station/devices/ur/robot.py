@@ -20,8 +20,8 @@ from station.cell.arm_acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
 from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
-from station.devices.base import fresh, ready
-from station.devices.news import CURRENT_S, RESTING_S, Delay
+from station.devices.base import look_at, wait_for_state
+from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Delay
 from station.devices.rtde import RuntimeState
 from station.devices.ur.child import ControlChild
 from station.devices.ur.condition import arm_held, control_ended, foreign_program
@@ -112,7 +112,7 @@ class UrRobot(UrLink):
             raise RobotError("control-started")
         self._stop_reason, self._ended_by, self._relied_on = "", None, True
         await self.idle()  # a child that is still ending keeps the registers
-        await ready(self)
+        await wait_for_state(self, checked=True)
         await self.may_start()
         if why := self._why_stopped():
             raise _stopped(f" before control started{why}")
@@ -140,14 +140,14 @@ class UrRobot(UrLink):
         try:
             await child.heard()
         except RobotError as error:
-            raise await cause_of_end(self, child, self._program_trouble(self.latest()) or error) from None
+            raise await cause_of_end(self, child, self._program_trouble(self.state()) or error) from None
 
     async def may_start(self) -> None:
         """Check that control can be started without replacing a program; else RobotError with remedy."""
         # e-Series controllers keep refusing commands on a connection that was opened in local mode.
         dashboard = await self.renew_dashboard()
         self.remote = await dashboard.remote()
-        state = await fresh(self)
+        state = await wait_for_state(self)
         if self.remote is False:
             raise RobotError("local-control")
         _, _, program = (await dashboard.ask("programState")).partition(" ")
@@ -192,7 +192,7 @@ class UrRobot(UrLink):
         self._moving, self._link_loss = True, ""
         try:
             await self._ready_to_move(child)
-            sample = self.newest()
+            sample = self.sample(MOVING_S)
             watch = MoveWatch(sample.state.joints_rad, joints_rad, sample.operation, time.monotonic())
             self._watch = watch
             await self._follow(watch, child, child.move(joints_rad, speed_rad_s, acceleration_rad_s2))
@@ -214,11 +214,11 @@ class UrRobot(UrLink):
     async def _ready_to_move(self, child: ControlChild) -> None:
         """Wait until the state is current, the arm may move, and the control process heard a heartbeat."""
         while True:
-            await ready(self)
+            await wait_for_state(self, checked=True)
             await child.heard()
             if self._child is not child:
                 raise _stopped()  # the arm was stopped during the wait
-            if self.check() is not None:
+            if look_at(self, checked=True) is not None:
                 return
 
     async def _follow(
@@ -238,8 +238,7 @@ class UrRobot(UrLink):
             raise _stopped(f": {self._stop_reason}")
         if sent.done():
             sent.result()
-        self.news()
-        sample = self.newest()
+        sample = self.sample(MOVING_S)
         if watch.step(sample.state, sample.operation, time.monotonic()) and sent.done():
             return True
         if (now_s := time.monotonic()) > self._tool_looked_s + TOOL_S:
@@ -282,7 +281,7 @@ class UrRobot(UrLink):
 
     def _seen_at_rest(self) -> bool:
         try:
-            return fastest_rad_s(self.latest()) < RESTING_RAD_S
+            return fastest_rad_s(self.state()) < RESTING_RAD_S
         except RobotError:
             return False
 
@@ -333,7 +332,7 @@ class UrRobot(UrLink):
         while self._one_way_s is not None and time.monotonic() < self._one_way_s + ONE_WAY_S:
             await asyncio.sleep(POLL_S)
             try:
-                if fastest_rad_s(self.latest()) < RESTING_RAD_S:
+                if fastest_rad_s(self.state()) < RESTING_RAD_S:
                     return
             except RobotError:
                 return
@@ -396,7 +395,7 @@ class UrRobot(UrLink):
             return
         try:
             child.check()
-            state = self.news()
+            state = look_at(self)
             if state is not None and (trouble := self._program_trouble(state)) is not None:
                 raise trouble
         except RobotError as error:

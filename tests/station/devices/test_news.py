@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
 
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.config import RobotConfig
-from station.devices.base import fresh
+from station.cell.errors import StaleStateError
+from station.devices.base import wait_for_state
 from station.devices.news import Delay, Evidence, is_loopback, largest_gap, longest_silence_s
 from station.devices.rtde import RuntimeState
 from station.devices.ur.condition import program_ended
@@ -32,6 +34,7 @@ class Reader:
     def __init__(self, made: Any, age_s: float, *, unread: bool = False, ended: str | None = None) -> None:
         self.ended, self._unread, self._link = ended, unread, made
         self.stands_still = self.not_finite = False
+        made.reader = self
         self._come(age_s)
 
     def _come(self, age_s: float) -> None:
@@ -45,7 +48,8 @@ class Reader:
 
 def link(age_s: float, *, moving: bool = False, **how: Any) -> UrLink:
     made: Any = UrLink(RobotConfig(model="UR10", host="192.0.2.10"))
-    made.reader, made.guided = Reader(made, age_s, **how), moving
+    Reader(made, age_s, **how)
+    made.guided = moving
     return made
 
 
@@ -66,12 +70,14 @@ def test_late_news_are_waited_for_longer_at_rest_after_what_came_was_read(
     age_s: float, how: Any, said: str
 ) -> None:
     made = link(age_s, **how)
-    if said in ("now", "late"):
-        assert (made.news() is not None) == (said == "now")
+    if said == "now":
+        assert made.state() and made.overdue() is None
         return
-    with raises(said) as told:
-        made.news()
-    assert said == "link-lost" or age_s <= told.value.values["age_s"] < age_s + 0.2
+    with pytest.raises(StaleStateError):
+        made.state()
+    overdue = made.overdue()
+    assert (overdue.code if overdue else "late") == said
+    assert said != "stale-state" or age_s <= overdue.values["age_s"] < age_s + 0.2
 
 
 def test_a_resting_arm_waits_for_its_dashboard_from_when_news_are_back() -> None:
@@ -81,18 +87,18 @@ def test_a_resting_arm_waits_for_its_dashboard_from_when_news_are_back() -> None
     late._tool = late._payload = None
     for age_s in (3.0, 0.0):
         late._deliver(arrived(time.monotonic() - age_s))
-    assert late.check() is None
+    assert not late.check(late.state())
     late._trouble_since_s -= 1.1
     late._deliver(arrived(time.monotonic()))
     with raises("dashboard"):
-        late.check()
+        late.check(late.state())
 
 
 async def test_the_news_that_come_are_the_ones_that_are_decided_on() -> None:
-    late = link(0.5)
-    answers = iter([None, None, arrived(7.0)])
-    late.news = lambda: next(answers)
-    assert (await fresh(late)).stamps.host_monotonic_ns == 7_000_000_000
+    late: Any = link(0.5)
+    answers = iter([StaleStateError(), StaleStateError(), arrived(7.0)])
+    late.state = Mock(side_effect=answers)
+    assert (await wait_for_state(late)).stamps.host_monotonic_ns == 7_000_000_000
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ async def test_robot_and_camera_stand_where_the_recorded_ones_stood(recording: P
     assert [p.joints_rad for p in plan.poses] == STARTS and plan.robot == "UR10"
     for number in (2, 0, 1):
         await robot.move(STARTS[number], 0.6, 1.0)
-        state = robot.latest()
+        state = robot.state()
         assert np.allclose(state.joints_rad, STARTS[number]) and not any(state.joint_speeds_rad_s)
         base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
         expected = forward(MODELS["UR10"], STARTS[number]) @ pose_from_rotvec(TCP[:3], TCP[3:])
@@ -123,7 +123,7 @@ async def test_states_are_published_and_stop_ends_a_move(recording: Path) -> Non
     await robot.stop("test")
     await moving
     await robot.close()
-    assert not robot.control and robot.latest().joints_rad == STARTS[0]
+    assert not robot.control and robot.state().joints_rad == STARTS[0]
 
 
 CONFIG = StationConfig(

@@ -97,7 +97,7 @@ async def arm(tmp_path: Path) -> AsyncIterator[PostedArm]:
 def trouble(arm: PostedArm) -> str:
     """Code of what keeps the arm from being captured; empty: nothing."""
     try:
-        arm.check()
+        arm.check(arm.state())
     except RobotError as error:
         return error.code
     return ""
@@ -106,7 +106,7 @@ def trouble(arm: PostedArm) -> str:
 def now(arm: PostedArm, seen: Callable[[RobotState], object]) -> bool:
     """True when the arm has news of which `seen` holds; late ones are waited for on a busy computer."""
     with contextlib.suppress(RobotError):
-        return (state := arm.news()) is not None and bool(seen(state))
+        return bool(seen(arm.state()))
     return False
 
 

@@ -143,7 +143,7 @@ async def test_control_starts_when_the_last_one_has_ended(
     robot: Any, ways: Ways, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "station.devices.ur.robot.ready", looks := AsyncMock(side_effect=RobotError("no-host"))
+        "station.devices.ur.robot.wait_for_state", looks := AsyncMock(side_effect=RobotError("no-host"))
     )
     robot._child = None
     robot._later(ways.end())

@@ -155,7 +155,7 @@ async def test_it_is_taken_where_no_picture_and_no_motion_relies_on_the_derived_
     robot: Any = UrRobot(RobotConfig(model="UR10", host="127.0.0.1"), tmp_path)
     robot._tool = TcpCheck(UR10, False, sample(FACTORY, HERE, TOOL), Installation())
     robot._primary = SimpleNamespace(installation=stated(FACTORY, TOOL), started="")
-    robot.latest, robot.dashboard = (lambda: sample(FACTORY, HERE, TOOL)), SimpleNamespace(alive=True)
+    robot.state, robot.dashboard = (lambda: sample(FACTORY, HERE, TOOL)), SimpleNamespace(alive=True)
     robot.guided = used == "guided"
     with suppress(RobotError):
         if used == "at":

@@ -39,7 +39,7 @@ async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_sess
     at = rig.arm.at
     rig.arm.at = lambda ns: told.append(ns) or at(ns)
     found = await rig.session.previews.observe(TAG)
-    state = rig.arm.latest()
+    state = rig.arm.state()
     assert found.corners == (0, 1, 2, 3)
     assert np.allclose(found.base_from_flange, flange_pose(state, rig.arm.identity.tcp_offset))
     assert len(told) == 1 and rig.camera.taken == 1
@@ -49,7 +49,7 @@ async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_sess
 
 async def test_no_picture_of_an_arm_that_moves_or_of_a_session_is_told(rig: Rig) -> None:
     rig.arm.rest()
-    at, state = rig.arm.at, rig.arm.latest()
+    at, state = rig.arm.at, rig.arm.state()
     rig.arm.at = lambda ns: msgspec.structs.replace(at(ns), joint_speeds_rad_s=(0.1,) * 6)
     with raises("moved-in-exposure"):
         await rig.session.previews.observe(TAG)

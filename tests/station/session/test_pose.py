@@ -39,7 +39,7 @@ async def test_a_tool_on_the_pendant_is_not_in_the_pose(rig: Rig, monkeypatch: p
 async def test_it_is_the_pose_of_mid_exposure(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not the newest one, and not the one when the picture came."""
     pictures: list[Image] = []
-    capture, latest = rig.camera.capture, rig.arm.latest
+    capture, latest = rig.camera.capture, rig.arm.state
     turned: dict[int, float] = {}
 
     async def noted(timeout_s: float = 5.0) -> Image:

@@ -41,16 +41,16 @@ async def test_what_holds_an_arm_at_rest_is_told(rig: Rig, monkeypatch: pytest.M
     def held() -> str:
         return rig.session.store.status.robot.condition.held
 
-    good = rig.arm.latest
+    good = rig.arm.state
     assert held() == ""
     stopped = msgspec.structs.replace(good(), safety_mode=SafetyMode.PROTECTIVE_STOP)
-    monkeypatch.setattr(rig.arm, "latest", lambda: stopped)
+    monkeypatch.setattr(rig.arm, "state", lambda: stopped)
     await until(lambda: held().startswith("protective stop:"))
     assert "acknowledge" not in held()  # nothing is latched here
     off = msgspec.structs.replace(good(), robot_mode=RobotMode.POWER_OFF)
-    monkeypatch.setattr(rig.arm, "latest", lambda: off)
+    monkeypatch.setattr(rig.arm, "state", lambda: off)
     await until(lambda: "has no power" in held())
-    monkeypatch.setattr(rig.arm, "latest", good)
+    monkeypatch.setattr(rig.arm, "state", good)
     await until(lambda: held() == "")
 
 

@@ -130,7 +130,9 @@ def _require_view(view: BoardView, fewest_corners: int) -> None:
 
     require(is_rigid(np.asarray(view.base_from_flange)), "robot-pose")
     require(T.shape == (4, 4), "no-board-pose", reason="none was given")
-    require(is_rigid(T) and bool(T[2, 3] > 0), "board-pose")
+    # told without pictures, it may be in a camera whose axes are not optical
+    in_front = bool(T[2, 3] > 0) or not fewest_corners
+    require(is_rigid(T) and in_front, "board-pose")
     finite = np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()
     right = bool(fewest_corners <= corners == points and finite)
     require(right, "corners", corners=corners, points=points, minimum=fewest_corners)

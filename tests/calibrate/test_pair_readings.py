@@ -340,3 +340,22 @@ def test_a_recording_of_the_boards_own_poses_is_not_solved(mount: Mount) -> None
     )
     with raises("boards-own-poses"):
         solve_views(ViewSet(mount, views, CameraModel(0, 0)))
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("axes", ["opengl", "ros"])
+def test_pairs_of_a_camera_whose_axes_are_not_optical_are_solved(
+    axes: CameraAxes, mount: Mount, tmp_path: Path
+) -> None:
+    """X is of the frame in which the board was told, behind it or beside it as it may lie."""
+    cell = Cell(mount, axes=axes)
+    found = believe(look(cell.write(tmp_path, *NAMES["camera-from-board"])), Given(mount=mount))
+    flange = np.array([row.base_from_flange for row in found.rows])
+    solved = solve_views(
+        ViewSet.from_poses(mount, flange, np.array([r.camera_from_board for r in found.rows]))
+    )
+    optical = solve_views(ViewSet.from_poses(mount, flange, replace(cell, axes="optical").truth[1]))
+    turned = pose(np.array(OPTICAL_FROM_AXES[axes]), np.zeros(3))
+    np.testing.assert_allclose(
+        solved.parent_from_child.matrix, optical.parent_from_child.matrix @ turned, atol=1e-4
+    )

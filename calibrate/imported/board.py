@@ -200,8 +200,10 @@ def _camera(
     return None if own is None else (own, False)
 
 
-_COLUMN_KEYS = ("columns", "cols", "num_x", "squares_x", "board_width", "width", "nx", "corners_x")
-_ROW_KEYS = ("rows", "num_y", "squares_y", "board_height", "height", "ny", "corners_y")
+_ACROSS = frozenset({"columns", "column", "cols", "col", "ncols", "width", "w", "x", "nx", "horizontal"})
+_DOWN = frozenset({"rows", "row", "nrows", "height", "h", "y", "ny", "vertical"})
+"""Words of keys that tell a board's two sides."""
+_ONE_OF_MANY = frozenset({"square", "tile", "marker", "tag"})
 _SQUARE = re.compile(r"square|tile|spacing|chessboard_dim|center_dist|tag_size", re.I)
 _MARKER = re.compile(r"(aruco|len|size|side).*marker|marker.*(dim|size|len|side)", re.I)
 
@@ -209,10 +211,12 @@ _MARKER = re.compile(r"(aruco|len|size|side).*marker|marker.*(dim|size|len|side)
 def _described(facts: dict[str, Any]) -> Iterator[tuple[BoardSpec, None]]:
     """Boards that the files describe, likeliest first."""
     text = " ".join(f"{key} {value}" for key, value in facts.items())
+    sides = _sides(facts)
+    counts = {key for both in sides for key in both}
 
     def length(wanted: re.Pattern[str]) -> float:
         for key, value in facts.items():
-            if wanted.search(key) and isinstance(value, (int, float)) and value > 0:
+            if key not in counts and wanted.search(key) and isinstance(value, (int, float)) and value > 0:
                 return value / 1000 if "mm" in key or value > 1 else float(value)
         mm = re.search(rf"(?:{wanted.pattern})\D{{0,20}}?(\d+\.?\d*) ?mm|^\D*(\d+\.?\d*) ?mm\b", text, re.I)
         return float(mm[mm.lastindex or 1]) / 1000 if mm and wanted is _SQUARE else 0.0
@@ -221,9 +225,7 @@ def _described(facts: dict[str, Any]) -> Iterator[tuple[BoardSpec, None]]:
     sizes = [
         (int(v[0]), int(v[1])) for k, v in facts.items() if re.search("pattern|board|size", k) and _two(v)
     ]
-    columns, rows = (next((facts[k] for k in keys if k in facts), None) for keys in (_COLUMN_KEYS, _ROW_KEYS))
-    if isinstance(columns, int) and isinstance(rows, int):
-        sizes.append((columns, rows))
+    sizes += [(int(facts[across]), int(facts[down])) for across, down in sides]
     sizes += [(int(a), int(b)) for a, b in re.findall(r"\b(\d{1,2}) ?[x×*] ?(\d{1,2})\b", text)]
     number = next((v for k, v in facts.items() if "dictionary" in k), None)
     names = {getattr(cv2.aruco, name): name for name in dir(cv2.aruco) if re.match(r"DICT_\d", name)}
@@ -242,6 +244,25 @@ def _described(facts: dict[str, Any]) -> Iterator[tuple[BoardSpec, None]]:
         else:
             for less in (0, 1):  # squares may have been counted
                 yield BoardSpec(BoardKind.CHESSBOARD, size[0] - less, size[1] - less, square_m), None
+
+
+def _sides(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    """The keys of columns and of rows that count a board's two sides: they differ by one word, as board_width
+    and board_height do. Those with more words come first.
+
+    Corners per row are columns. A square's own width is a length.
+    """
+    sides: dict[tuple[str, ...], dict[bool, str]] = {}
+    for key, value in facts.items():
+        words = re.findall(r"[a-z]+", key)
+        is_count = isinstance(value, (int, float)) and float(value).is_integer()
+        turned = "per" in words
+        for word in words if is_count and _ONE_OF_MANY.isdisjoint(words) else ():
+            if word in _ACROSS | _DOWN:
+                alike = tuple(other for other in words if other != word)
+                sides.setdefault(alike, {}).setdefault((word in _ACROSS) != turned, key)
+    both = [alike for alike, each in sides.items() if len(each) == len((True, False))]
+    return [(sides[alike][True], sides[alike][False]) for alike in sorted(both, key=len, reverse=True)]
 
 
 def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:

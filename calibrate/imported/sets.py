@@ -135,10 +135,12 @@ def pairs_of(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
     by_identity = _by_identities(table.images, numbers)
     if by_identity:
         return by_identity
+    rows = _row_numbers(table)
+    if "#" in table.name and len(set(numbers.values())) == len(paths) and set(numbers.values()) == set(rows):
+        return {path: rows[number] for path, number in numbers.items()}
     ordered = sorted(paths, key=natural)
     if len(paths) == len(table.numbers):
         return {path: row for row, path in enumerate(ordered)}
-    rows = _row_numbers(table)
     if "#" not in table.name:  # some images are gone, neither the first nor the last
         first, last = min(numbers.values(), default=0), max(numbers.values(), default=0)
         counted = first in (0, 1) and last - first + 1 == len(table.numbers)

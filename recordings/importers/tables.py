@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,7 +129,7 @@ class Contents:
     cameras: list[tuple[Array, tuple[float, ...]]] = field(default_factory=list)
     """Matrix (3, 3) and distortion, each once."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """Values of leaves that describe a board, by lower-case key."""
+    """Values of leaves that describe a board, by key: `boardWidth` is board_width."""
     words: str = ""
     """The folder's last names, names of files and keys: what may say how the camera is mounted."""
     files: dict[str, str] = field(default_factory=dict)
@@ -151,6 +151,8 @@ class _Row:
     place: tuple[int, ...]
     told: bool
     file: str
+    labels: dict[str, str]
+    """Other words and whole numbers told beside the numbers, by column or key."""
 
 
 def look(
@@ -217,7 +219,7 @@ def look(
                 place = (*_numbers_in(name), *node.place)
                 key = ".".join(node.keys), rotation, half, str(len(numbers))
                 is_told = file in (path, *path.parents)
-                told[key].append(_Row(numbers, node.image, place, is_told, alike))
+                told[key].append(_Row(numbers, node.image, place, is_told, alike, node.labels))
         for (named, *form), each in told.items():  # files of one row each make a table together
             holder = alike if len(each) == 1 else name
             for single in each:
@@ -229,10 +231,12 @@ def look(
     told_tables: list[Table] = []
     for name, rotation, each in _joined(rows):
         for part, some in _parts_of(each).items():
-            table = _without_count(np.array([row.numbers for row in some]))
+            told_numbers = np.array([row.numbers for row in some])
+            table = _without_count(told_numbers)
             poses_alike = table.shape[1] in (6, 7, 12, 16) and float(np.abs(table).max()) <= _NUMBER_LIMIT
             if len(some) >= 3 and poses_alike:
-                beside = [row.image for row in some], [row.place for row in some]
+                counts = told_numbers[:, 0] if table.shape[1] < told_numbers.shape[1] else None
+                beside = _names_of_rows(some, counts, found.images), [row.place for row in some]
                 found.tables.append(
                     Table(_name_of_part(name, part), rotation, table, *beside, files=some[0].file)
                 )
@@ -298,7 +302,40 @@ def _without_count(table: Array) -> Array:
         return table[:, :-1]
     first = table[:, 0]
     rises = bool((np.diff(first) > 0).all()) and (columns != 7 or not np.any(first % 1))
+    if columns != 7 and _are_counts(first):  # in whatever order
+        rises = True
     return table[:, 1:] if rises and columns in (7, 8, 13, 17) else table
+
+
+def _are_counts(numbers: Array) -> bool:
+    """Tell whether numbers (n,) are whole ones, each once."""
+    return len(np.unique(numbers)) == len(numbers) and not np.any(numbers % 1)
+
+
+def _names_of_rows(rows: list[_Row], counts: Array | None, images: dict[str, list[Path]]) -> list[str]:
+    """Name or number of each row's image: as a column or key says that names one, else by whatever is told
+    beside the numbers and names all images of a family, each once; empty: nothing does."""
+    told = [row.image for row in rows]
+    ways = [told]
+    ways += [[row.labels.get(key, "") for row in rows] for key in rows[0].labels]
+    if counts is not None and _are_counts(counts):
+        ways.append([str(int(count)) for count in counts])
+    for names in ways:
+        if len(set(names)) < len(rows):
+            continue
+        numbers = [(re.findall(r"\d+", name) or [""])[-1][-_DIGITS_LIMIT:] for name in names]
+        for paths in images.values():
+            if {path.stem for path in paths} <= {PurePath(name).stem for name in names}:
+                return names
+            if _running_numbers(paths) == {int(number) for number in numbers if number}:
+                return numbers
+    return told
+
+
+def _running_numbers(paths: list[Path]) -> set[int]:
+    """The last numbers of the names of images; empty: they do not tell all apart."""
+    found = {int(each[-1][-_DIGITS_LIMIT:]) for path in paths if (each := re.findall(r"\d+", path.stem))}
+    return found if len(found) == len(paths) else set()
 
 
 def _named_so(tables: list[Table], end: str) -> list[Table]:
@@ -416,27 +453,36 @@ class _Node:
     keys: tuple[str, ...]
     place: tuple[int, ...]
     image: str
+    labels: dict[str, str]
 
 
-def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] = ()) -> Iterator[_Node]:
+def _nodes(
+    tree: Any,
+    keys: tuple[str, ...],
+    image: str,
+    place: tuple[int, ...] = (),
+    labels: dict[str, str] | None = None,
+) -> Iterator[_Node]:
     """The tree's nodes, those inside of a pose or of its half left out."""
     if isinstance(tree, dict):
         image = _image_of(tree) or image
-    yield (node := _Node(tree, keys, place, image))
+        labels = _labels_of(tree) or labels
+    labels = labels or {}
+    yield (node := _Node(tree, keys, place, image, labels))
     if (isinstance(tree, list) or _is_matrix(tree)) and (_pose(tree) or _half(node)):
         return
     if _is_matrix(tree):  # its rows and columns are no board's
-        yield from _nodes(_rows_of_matrix(tree), keys, image, place)
+        yield from _nodes(_rows_of_matrix(tree), keys, image, place, labels)
     elif isinstance(tree, dict):
-        yield from (_Node(parts, (*keys, stem), place, image) for stem, parts in _stems(tree))
+        yield from (_Node(parts, (*keys, stem), place, image, labels) for stem, parts in _stems(tree))
         for key, value in tree.items():
             name = str(key)[:_TEXT_LIMIT]
             named = name if IMAGE.fullmatch(name) else image
-            yield from _nodes(value, (*keys, _pattern(name)), named, (*place, *_numbers_in(str(key))))
+            yield from _nodes(value, (*keys, _pattern(name)), named, (*place, *_numbers_in(str(key))), labels)
     elif isinstance(tree, list):
         for at, value in enumerate(tree):
             if isinstance(value, (dict, list)):
-                yield from _nodes(value, keys, image, (*place, at))
+                yield from _nodes(value, keys, image, (*place, at), labels)
 
 
 def _image_of(row: dict[str, Any]) -> str:
@@ -452,6 +498,18 @@ def _image_of(row: dict[str, Any]) -> str:
         if isinstance(value, (int, float)) and abs(value) < _NUMBER_LIMIT and float(value).is_integer():
             return str(int(value))
     return ""
+
+
+def _labels_of(row: dict[str, Any]) -> dict[str, str]:
+    """What is told beside the numbers of a row and may name its image, by key: words and whole numbers."""
+    labels: dict[str, str] = {}
+    for key, value in row.items():
+        name = str(key)[:_TEXT_LIMIT]
+        if isinstance(value, str) and 0 < len(value) <= _TEXT_LIMIT:
+            labels[name] = value
+        elif isinstance(value, (int, float)) and abs(value) < _NUMBER_LIMIT and float(value).is_integer():
+            labels[name] = str(int(value))
+    return labels
 
 
 def _rows_of_matrix(matrix: dict[str, Any]) -> list[Any]:
@@ -545,7 +603,7 @@ def _facts(node: _Node, found: Contents) -> bool:
     numbers = _flat(node.value) if isinstance(node.value, (list, dict)) else None
     if numbers and not np.isfinite(numbers).all():
         return False
-    key = node.keys[-1].lower() if node.keys else ""
+    key = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", node.keys[-1]).lower() if node.keys else ""
     tells = bool(_OF_BOARDS.search(key))
     if numbers and len(numbers) >= 9:
         K = np.array(numbers[:9]).reshape(3, 3)

@@ -85,7 +85,7 @@ def _seen_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def seen(held: Any, given: Any, paths: list[Path], progress: Any) -> board.Seen | None:
         keys = [_hash(path) for path in paths]
-        key = given, len(held.cameras), *keys
+        key = given, len(held.cameras), repr(held.facts), *keys
         if key not in _SEEN:
             found = board.see_board(held, given, paths, progress)
             _SEEN[key] = found, dict(zip(paths, keys, strict=True))
@@ -217,6 +217,33 @@ def test_rows_go_by_the_names_that_they_tell(
 def test_rows_go_by_the_numbers_of_a_column(head: str, shots: Shots, tmp_path: Path) -> None:
     save_images(shots, tmp_path, "img_{n}.png")
     csv_with_a_header(tmp_path, shots.flanges["one"], [str(n + 1) for n in range(VIEWS)], head)
+    require_right(shots, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("head", "told"),
+    [("frame_id", "{n}"), ("Nr", "{n}"), ("pose", "pose_{n}"), ("Bild", "img_{n}"), ("stamp", "{n:03d}")],
+)
+def test_rows_go_by_any_column_that_names_the_images(
+    head: str, told: str, shots: Shots, tmp_path: Path
+) -> None:
+    save_images(shots, tmp_path, "img_{n}.png")
+    csv_with_a_header(tmp_path, shots.flanges["one"], [told.format(n=n + 1) for n in range(VIEWS)], head)
+    require_right(shots, tmp_path)
+
+
+def test_rows_go_by_a_first_number_in_any_order(shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "img_{n}.png")
+    rows = [f"{n + 1} {line}" for n, line in enumerate(lines(quaternions(shots.flanges["one"]), " "))]
+    (tmp_path / "robot.txt").write_text("\n".join(rows[k] for k in ORDER))
+    require_right(shots, tmp_path)
+
+
+@pytest.mark.parametrize("key", ["img_{n}", "pose{n:02d}", "{n}"])
+def test_rows_go_by_the_numbers_of_their_keys(key: str, shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "img_{n}.png")
+    told = {key.format(n=k + 1): {"tcp": shots.flanges["one"][k].tolist()} for k in ORDER}
+    (tmp_path / "robot.json").write_text(json.dumps(told))
     require_right(shots, tmp_path)
 
 
@@ -599,6 +626,33 @@ def test_another_table_beside_the_one_that_is_used_is_named(shots: Shots, tmp_pa
         np.savetxt(tmp_path / f"robot_{n}.csv", quaternions(shots.flanges[scene]))
     assert require_right(shots, tmp_path) == {"one"}
     assert len(believe(look(tmp_path), GIVEN).unused) == 1
+
+
+# ---- how others describe a board
+
+DESCRIBED = {
+    "board.yml": "%YAML:1.0\n---\nsquareSize: 25.0\nboardWidth: 7\nboardHeight: 6\n",
+    "settings.xml": "<?xml version='1.0'?><opencv_storage><Settings><BoardSize_Width>7</BoardSize_Width>"
+    "<BoardSize_Height>6</BoardSize_Height><Square_Size>25</Square_Size></Settings></opencv_storage>",
+    "board.json": '{"image": {"width": 48, "height": 38}, '
+    '"nCornersX": 7, "nCornersY": 6, "squareSizeMm": 25}',
+    "board_w.yaml": "board_w: 7\nboard_h: 6\nsquare_size: 0.025\n",
+    "pattern.yaml": "pattern_cols: 7\npattern_rows: 6\nsquare_length: 0.025\n",
+    "corners.yaml": "corners_per_row: 7\ncorners_per_col: 6\nsquare_length_mm: 25\n",
+    "num.yaml": "numCornersHorizontal: 7\nnumCornersVertical: 6\nsquareMm: 25\n",
+    "squares.json": '{"squaresX": 8, "squaresY": 7, "squareLength": 0.025}',
+    "checker.yaml": "checkerboardRows: 6\ncheckerboardColumns: 7\ncheckerboardSquareSize: 0.025\n",
+}
+
+
+@pytest.mark.parametrize("name", DESCRIBED)
+def test_a_board_is_read_as_a_file_describes_it(name: str, shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    (tmp_path / name).write_text(DESCRIBED[name])
+    board_read = believe(look(tmp_path), Given(mount="eye-in-hand")).dataset.board
+    assert (board_read.columns, board_read.rows, board_read.square_m) == (7, 6, 0.025)
+    assert not board_read.square_guessed
 
 
 # ---- what others left

@@ -144,7 +144,8 @@ def joints_of(held: Contents, best: TableReading) -> tuple[Table, bool] | None:
     for table in held.tables:
         joints = joints_rad(table)[:_MOST_ROWS]
         rows, count = joints.shape
-        if count > 7 or rows < 2 * count or len(table.numbers) != len(best.table.numbers):
+        is_read = table is best.table or table.name == best.family  # as poses of robot or board
+        if is_read or count > 7 or rows < 2 * count or len(table.numbers) != len(best.table.numbers):
             continue
         with suppress(np.linalg.LinAlgError, ValueError):
             straight, inverted = (learn_chain(joints, F, 3).explains for F in (flanges, inverse(flanges)))

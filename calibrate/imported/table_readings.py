@@ -40,6 +40,9 @@ _AS_TOLD = "as told"
 _MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 _MOST = 12
 """Most readings of one table that are fitted: those by which the board seems to move least."""
+_HOPELESS = 10.0
+_STANDS_M = 0.001
+"""A reading by which the board moves so many times as far as by the best, or as this length, is not fitted."""
 _EXPLAINED = 4
 """Most readings of a refused folder that are tried with their rows shifted, mirrored and the like."""
 _MOVES = 0.01
@@ -128,8 +131,10 @@ def table_readings(
             moves = [(_moves(seen, keys, flange, mount), mount) for mount in _MOUNTS]
             likely += [(moved, how, evidence, flange, seen, keys, mount) for moved, mount in moves]
     likely.sort(key=lambda each: each[0])
+    farthest = _HOPELESS * max(likely[0][0], _STANDS_M) if likely else 0.0
     as_told = [each for each in likely if each[2] == _AS_TOLD][:_MOST]
-    others = list(_once([each for each in likely if each[2] != _AS_TOLD]))[:_MOST]
+    untold = [each for each in likely if each[2] != _AS_TOLD and each[0] < farthest]
+    others = list(_once(untold))[:_MOST]
     for _, how, evidence, flange, seen, keys, mount in as_told + others:
         fitted = _fitted(seen, keys, flange, mount)
         if fitted is not None:

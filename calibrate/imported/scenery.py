@@ -7,8 +7,11 @@ so that the tiles speak, not the points.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.boards.corners import Grey
 from calibrate.geometry import Array
@@ -35,23 +38,44 @@ _SCENE, _OTHER, _ODDS = 0.75, 0.25, 1000.0
 mounting must be so much likelier."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Shapes:
+    """One reduced picture."""
+
+    fine: Array
+    """Its fine shapes."""
+    contrast: Array
+    """Mean square of them in each cell."""
+    outline: NDArray[np.int32]
+    """(k, 2) corners of where the board may be."""
+    middle: Array
+    """(2,) the board's, px."""
+
+
 def mount_by_scene(images: list[tuple[Grey, BoardView]], camera: CameraModel) -> set[Mount]:
     """The mounting by which what is around the board is far likelier; empty: neither.
 
     The pictures may be smaller than the camera's, to which the views' pixels belong.
     """
     greys = [grey for grey, _ in images[:_VIEWS]]
-    black = np.max(greys, axis=0, initial=0) <= _BLACK  # beside straightened pictures
-    return _by_tiles(images, camera, black) & _by_tiles(images, camera, np.zeros_like(black))
+    shapes = [_shapes(grey, view, camera) for grey, view in images[:_VIEWS]]
+    if not shapes:
+        return set()
+    black = np.max(greys, axis=0) <= _BLACK  # beside straightened pictures
+    found = _by_tiles(shapes, np.zeros_like(black))
+    return found & _by_tiles(shapes, black) if found and black.any() else found
 
 
-def _by_tiles(images: list[tuple[Grey, BoardView]], camera: CameraModel, black: Array) -> set[Mount]:
-    cells = [_cells(grey, view, camera, black) for grey, view in images[:_VIEWS]]
+def _by_tiles(shapes: list[_Shapes], black: Array) -> set[Mount]:
+    height, width = shapes[0].fine.shape
+    reduced = cv2.resize(black.astype(float), (width, height), interpolation=cv2.INTER_AREA)
+    hidden = cv2.dilate(reduced, _AROUND)
+    boards = [cv2.fillConvexPoly(hidden.copy(), each.outline, 1.0) for each in shapes]
     told = np.zeros((2, *_TILES))
     for step in (1, 2):
-        for (grey, board, middle), (other, its_board, its_middle) in zip(cells, cells[step:], strict=False):
-            if np.linalg.norm(middle - its_middle) > _MOVED_PX:
-                told += _compare(grey, other, np.maximum(board, its_board))
+        for n, (one, other) in enumerate(zip(shapes, shapes[step:], strict=False)):
+            if np.linalg.norm(one.middle - other.middle) > _MOVED_PX:
+                told += _compare(one, other, np.maximum(boards[n], boards[n + step]))
     stay, change = told
     clear = stay + change >= _FEWEST
     stays = stay > _KEEPS * (stay + change)
@@ -59,24 +83,23 @@ def _by_tiles(images: list[tuple[Grey, BoardView]], camera: CameraModel, black: 
     return set() if abs(log_odds) < np.log(_ODDS) else {"eye-to-hand" if log_odds > 0 else "eye-in-hand"}
 
 
-def _cells(grey: Grey, view: BoardView, camera: CameraModel, black: Array) -> tuple[Array, Array, Array]:
-    """(fine shapes of the reduced picture, 1 where the board or nothing is in it, the board's middle)"""
+def _shapes(grey: Grey, view: BoardView, camera: CameraModel) -> _Shapes:
     size = _WIDTH_PX, round(_WIDTH_PX * camera.height / camera.width)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     seen = ((view.pixels + 0.5) * _WIDTH_PX / camera.width - 0.5).astype(np.float32)
-    outline = cv2.convexHull(seen)[:, 0]
-    outline = seen.mean(axis=0) + _CLEAR * (outline - seen.mean(axis=0))
-    hidden = cv2.dilate(cv2.resize(black.astype(float), size, interpolation=cv2.INTER_AREA), _AROUND)
-    board = cv2.fillConvexPoly(hidden, np.round(outline).astype(np.int32), 1.0)
-    fine = cv2.GaussianBlur(small, (0, 0), 1) - cv2.GaussianBlur(small, (0, 0), _FINE_PX)
-    return np.asarray(fine, float), np.asarray(board), np.asarray(seen.mean(axis=0))
+    middle = seen.mean(axis=0)
+    outline = middle + _CLEAR * (cv2.convexHull(seen)[:, 0] - middle)
+    blurred = cv2.GaussianBlur(small, (0, 0), 1) - cv2.GaussianBlur(small, (0, 0), _FINE_PX)
+    fine = np.asarray(blurred, float)
+    return _Shapes(fine, _means(fine**2, _CELLS), np.round(outline).astype(np.int32), np.asarray(middle))
 
 
-def _compare(one: Array, other: Array, board: Array) -> Array:
+def _compare(one: _Shapes, other: _Shapes, board: Array) -> Array:
     """Shares of each tile's cells that stay and that change, (2, tiles, tiles)."""
-    both, a, b, covered = (_means(each, _CELLS) for each in (one * other, one**2, other**2, board))
-    told = (np.minimum(a, b) > _CONTRAST**2) & (covered == 0)
-    alike = both / np.sqrt(a * b + 1e-9)
+    both = _means(one.fine * other.fine, _CELLS)
+    covered = _means(board, _CELLS)
+    told = (np.minimum(one.contrast, other.contrast) > _CONTRAST**2) & (covered == 0)
+    alike = both / np.sqrt(one.contrast * other.contrast + 1e-9)
     return np.array([_means(told & each, _TILES) for each in (alike > _STAYS, alike < _CHANGES)])
 
 

@@ -42,7 +42,7 @@ _MOST = 12
 """Most readings of one table that are fitted: those by which the board seems to move least."""
 _HOPELESS = 10.0
 _STANDS_M = 0.001
-"""A reading by which the board moves so many times as far as by the best, or as this length, is not fitted."""
+"""A reading by which the board moves so many times as far as by the best, or as this length, is not tried."""
 _EXPLAINED = 4
 """Most readings of a refused folder that are tried with their rows shifted, mirrored and the like."""
 _MOVES = 0.01

@@ -85,7 +85,8 @@ def _seen_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def seen(held: Any, given: Any, paths: list[Path], progress: Any) -> board.Seen | None:
         keys = [_hash(path) for path in paths]
-        key = given, len(held.cameras), repr(held.facts), *keys
+        facts = "" if given else repr(held.facts)
+        key = given, len(held.cameras), facts, *keys
         if key not in _SEEN:
             found = board.see_board(held, given, paths, progress)
             _SEEN[key] = found, dict(zip(paths, keys, strict=True))

@@ -23,6 +23,7 @@ from calibrate.imported.sets import (
     are_rivals,
     are_sessions,
     boards_named,
+    cameras_apart,
     image_sets,
     pair_sets,
     pairs_of,
@@ -125,9 +126,10 @@ def believe(
     board_told = given.board is not None
     if told is not None:
         if told.poses is not None and given == Given() and held.told is None:
-            return _as_before(held, told, told.poses)
+            return _as_before(cameras_apart(held, held.tables), told, told.poses)
         given = replace(given, mount=given.mount or told.mount, board=given.board or told.board)
     robots = _robots(held)
+    held = cameras_apart(held, robots)
     sets = image_sets(held, robots, given.images)
     good: list[tuple[ImageSet, list[TableReading]]] = []
     tried: list[TableReading] = []

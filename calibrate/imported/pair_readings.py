@@ -220,7 +220,11 @@ def scales(held: Contents, best: TableReading) -> list[float]:
         if stands:
             found[unit] = factor
     named = unit_named(held.words)
-    return [found[named]] if named in found else [*found.values()] or [1.0]
+    if named in found:
+        return [found[named]]
+    if best.seen.convention is None and found.keys() in ({"cm"}, {"inch"}):
+        return [meant_m / unit_m for meant_m in UNITS.values()]  # so rare that a reach alone tells it not
+    return [*found.values()] or [1.0]
 
 
 def rescaled(best: TableReading, factor: float) -> TableReading:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations
 from pathlib import Path, PurePosixPath
@@ -24,6 +24,8 @@ _SHARED = 0.8
 """Share of rows and images that must have numbers in common, where they are paired by numbers."""
 _COMPARED = 3
 """Images of two families that are compared before they are called the same pictures."""
+_MOST_CAMERAS = 4
+"""Most cameras whose images differ by a digit of their names."""
 _MADE = re.compile(
     r"draw|calibrated|overlay|visual|detect|result|undist|depth|corner|(?<![a-z])IR\b|axes", re.I
 )
@@ -59,6 +61,42 @@ class PairSet:
     board: Table
     pairs: dict[Key, int]
     """Row of the board's → row of the robot's."""
+
+
+def cameras_apart(held: Contents, robots: list[Table]) -> Contents:
+    """The same folder, in which images that go with no table as a whole, and do by a digit of their names,
+    are families of their own: im_#_0.png and im_#_1.png."""
+    images: dict[str, list[Path]] = {}
+    files = dict(held.files)
+    for family, paths in held.images.items():
+        whole = any(pairs_of(robot, paths) for robot in robots)
+        parts = {} if whole else _parts_by_digit(family, paths)
+        if not any(len(pairs_of(robot, part)) >= FEWEST for robot in robots for part in parts.values()):
+            parts = {family: paths}
+        images |= parts
+        for name, part in parts.items():
+            files |= {str(path.relative_to(held.root)): name for path in part if name != family}
+    return replace(held, images=images, files=files)
+
+
+def _parts_by_digit(family: str, paths: list[Path]) -> dict[str, list[Path]]:
+    """Images of a family by a number in their names that has few values, with the same others beside each."""
+    numbers = {path: re.findall(r"\d+", path.name) for path in paths}
+    counts = {len(each) for each in numbers.values()}
+    for column in range(max(counts)) if len(counts) == 1 else ():
+        by_value = defaultdict[str, list[Path]](list)
+        for path, each in numbers.items():
+            by_value[each[column]].append(path)
+        others = [
+            {(path.parent, *numbers[path][:column], *numbers[path][column + 1 :]) for path in part}
+            for part in by_value.values()
+        ]
+        if 1 < len(by_value) <= _MOST_CAMERAS and all(each == others[0] for each in others):
+            folder, mark, name = family.rpartition("/")
+            pieces = name.split("#")
+            before, behind = "#".join(pieces[: column + 1]), "#".join(pieces[column + 1 :])
+            return {f"{folder}{mark}{before}{value}{behind}": part for value, part in by_value.items()}
+    return {}
 
 
 def image_sets(held: Contents, robots: list[Table], told: str | None) -> list[ImageSet]:

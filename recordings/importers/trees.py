@@ -61,13 +61,13 @@ def read_tree(path: Path) -> Any:
     try:
         if suffix in _ARRAYS:
             content = read_file(path, _ARRAY_LIMIT_BYTES)  # larger: an image of depths
-            return {name: array.tolist() for name, array in _arrays(path, content).items()}
+            return {name: _poses_first(array).tolist() for name, array in _arrays(path, content).items()}
         if suffix not in DATA_SUFFIXES:
             return None
         content = read_file(path, _BYTES_LIMIT)
         if suffix == ".xml":  # says itself in which letters it is written
             return _of_xml(ElementTree.fromstring(content))
-        text = _decoded(content)
+        text = _decoded(content).replace("\N{MINUS SIGN}", "-")
         if suffix == ".json":
             return json.loads(text)
         if suffix in _YAML:
@@ -126,6 +126,14 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray[Any, Any]]:
         raise
     except Exception as error:  # zlib's, zipfile's, the libraries' own and those that they did not foresee
         raise UnreadableArraysError(str(error) or repr(error)) from error
+
+
+def _poses_first(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Matrices that MATLAB stacks behind each other, (4, 4, n), as (n, 4, 4); others as they are."""
+    stacked = array.ndim == 3 and array.shape[:2] == (4, 4) and array.dtype.kind in "fiu"
+    if stacked and np.allclose(array[3], [[0], [0], [0], [1]]):
+        return np.moveaxis(array, 2, 0)
+    return array
 
 
 def _unpacked(content: bytes) -> dict[str, np.ndarray[Any, Any]]:

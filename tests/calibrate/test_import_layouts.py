@@ -15,6 +15,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from calibrate.geometry import pose, rotation_exp
@@ -303,6 +304,29 @@ def test_other_encodings_of_trees(suffix: str, encoding: str, shots: Shots, tmp_
     require_right(shots, tmp_path)
 
 
+def test_matrices_stacked_along_the_last_axis_are_poses(shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    savemat(tmp_path / "poses.mat", {"robotPoses": np.moveaxis(shots.flanges["one"], 0, 2)})
+    require_right(shots, tmp_path)
+
+
+def test_a_typographic_minus_is_a_sign(shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    text = "\n".join(lines(quaternions(shots.flanges["one"]), " "))
+    (tmp_path / "robot.txt").write_text(text.replace("-", "\N{MINUS SIGN}"))
+    require_right(shots, tmp_path)
+
+
+def test_a_unit_that_nobody_named_is_asked_about(shots: Shots, tmp_path: Path) -> None:
+    """Decimetres are among none of those that are known, and look like inches of a small arm."""
+    save_images(shots, tmp_path, "images/{n}.png")
+    T = shots.flanges["one"].copy()
+    T[:, :3, 3] *= 10
+    np.savetxt(tmp_path / "robot.txt", quaternions(T))
+    with raises("several-readings", SeveralReadingsError):
+        believe(look(tmp_path), Given(mount="eye-in-hand"))
+
+
 @pytest.mark.parametrize(
     "plain", ["0.1, 0.2, 0.3, 1, 2, 3", "1,2,3,4,5,6", "0, 0, 100, 1, 2, 3", "1;2;3;4;5;6"]
 )
@@ -406,6 +430,9 @@ CAMERAS = (
     ("cam0/{n}.png", "cam1/{n}.png"),
     ("pose_{n}/left.png", "pose_{n}/right.png"),
     ("{n}_a.png", "{n}_b.png"),
+    ("im_{n}_0.png", "im_{n}_1.png"),
+    ("cam_0_img_{n}.png", "cam_1_img_{n}.png"),
+    ("run 1/camera0_{n:02d}.png", "run 1/camera1_{n:02d}.png"),
 )
 
 

@@ -135,6 +135,7 @@ def believe(
     tried: list[TableReading] = []
     problem: ImportSourceError | None = None
     board_seen = False
+    without_board: list[str] = []
     for each in sets:
         if good and each.is_made:
             break
@@ -151,7 +152,9 @@ def believe(
         except ImportSourceError as unreadable:  # others may be pictures: maps of depths lie beside them
             problem = problem or unreadable
             continue
-        if seen is not None:
+        if seen is None:
+            without_board.append(each.family)
+        else:
             board_seen = True
             for table, pairs in each.rows:
                 readings += table_readings(table, each.family, pairs, [seen], given.convention)
@@ -179,7 +182,22 @@ def believe(
         said = describe_board(given.board)
         raise ImportSourceError("told-board-unseen", source=held.root, board=said, images=families)
     tried = without_boards_own(held, tried)
-    return _believed(held, given, decide(held, tried, given.convention, given.mount))
+    best = decide(held, tried, given.convention, given.mount)
+    if best.seen.convention is None or not without_board:
+        return _believed(held, given, best)
+    return _believed_beside_images(held, given, best, _listed(without_board))
+
+
+def _believed_beside_images(held: Contents, given: Given, best: TableReading, images: str) -> Believed:
+    """Pairs of poses where images lie beside them that show no board: a person is told so, or asked."""
+    try:
+        believed = _believed(held, given, best)
+    except SeveralReadingsError as question:
+        beside = f"No board was found in the images beside ({images}): with --board they may decide, too."
+        decides = f"{question.values['decides']} {beside}"
+        raise several_readings(held.root, question.readings, decides) from None
+    seen = {"images": (f"none: no board was found in {images}", "with --board they are looked at again")}
+    return replace(believed, facts=seen | believed.facts)
 
 
 def _robots(held: Contents) -> list[Table]:

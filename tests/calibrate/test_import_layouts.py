@@ -544,6 +544,20 @@ def test_sessions_of_pairs_are_never_mixed(name: str, tmp_path: Path) -> None:
         )
 
 
+def test_images_without_a_board_beside_pairs_are_named(tmp_path: Path) -> None:
+    scene = Scene(views=12)
+    for of, poses in (("robot", scene.flange_poses()[0]), ("target_in_cam", scene.camera_from_board())):
+        np.savetxt(tmp_path / f"{of}.txt", quaternions(np.array(poses)))
+    for n in range(12):
+        cv2.imwrite(str(tmp_path / f"shot{n}.png"), np.full((384, 480), 10 * n, np.uint8))
+    with raises("several-readings", SeveralReadingsError) as asked:
+        believe(look(tmp_path))
+    assert "shot#.png" in str(asked.value.values["decides"])
+    believed = believe(look(tmp_path), Given(mount="eye-in-hand"))
+    assert len(believed.rows) == 12
+    assert "shot#.png" in believed.facts["images"][0]
+
+
 def camodocals(folder: Path, robot: np.ndarray, seen: np.ndarray, name: str = "T{of}_{n}") -> None:
     rows = {}
     for n in range(len(robot)):

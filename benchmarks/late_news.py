@@ -110,13 +110,13 @@ async def rig(folder: Path) -> AsyncIterator[Rig]:
     controller = await asyncio.to_thread(start_controller, "UR10e")
     robot = UrRobot(RobotConfig(model="UR10e", host=controller.host), folder)
     made = Rig(controller, controller.admin(), controller.admin(), robot)
-    robot.subscribe(made.on_state)
-    await robot.connect()
+    robot.link.subscribe(made.on_state)
+    await robot.link.connect()
     beating = asyncio.create_task(made.beat())
     try:
         yield made
     finally:
-        await robot.close()
+        await robot.link.close()
         beating.cancel()
         made.admin.close()
         made.cable.close()
@@ -130,12 +130,12 @@ async def at_rest(made: Rig, fault: Fault, late_s: float) -> tuple[str, str]:
     await asyncio.sleep(min(0.11, late_s / 2))
     said = "waited"
     try:
-        await wait_for_state(made.robot, checked=True)
+        await wait_for_state(made.robot.link, checked=True)
     except RobotError as error:
         said = f"fault: {error.code}"
     await faulty
     await asyncio.sleep(0.15)
-    cause = made.robot.delay(made.lag_s, began_s - 0.05)
+    cause = made.robot.link.delay(made.lag_s, began_s - 0.05)
     await asyncio.sleep(0.1)
     return said, cause.code if cause else "–"
 
@@ -143,7 +143,7 @@ async def at_rest(made: Rig, fault: Fault, late_s: float) -> tuple[str, str]:
 async def moving(made: Rig, fault: Fault, late_s: float) -> tuple[str, float]:
     """What ended the move, '' for nothing, and when the arm rested after its news ended, seconds."""
     await made.start()
-    joints = list(made.robot.sample(math.inf, connected=False).state.joints_rad)
+    joints = list(made.robot.link.states.sample(math.inf, connected=False).state.joints_rad)
     joints[0] += FAR_RAD if joints[0] < 0 else -FAR_RAD
     move = asyncio.create_task(made.robot.move(joints, 0.5, 1.0))
     while not move.done() and await asyncio.to_thread(made.speed_rad_s) < 0.4:

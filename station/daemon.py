@@ -148,7 +148,7 @@ def configured_cell(config: StationConfig, text: bytes, log_dir: Path, control: 
     from station.devices.ur import UrRobot
 
     robot = UrRobot(config.robot, log_dir)
-    return Cell(config, robot, camera, source, mover=robot, trigger=trigger, config_text=text)
+    return Cell(config, robot.link, camera, source, mover=robot, trigger=trigger, config_text=text)
 
 
 def _camera(config: StationConfig, trigger: SerialTrigger | None) -> tuple[Camera, Source]:

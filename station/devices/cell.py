@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class Cell:
     config: StationConfig
     arm: Arm
-    """What tells where the arm is. For a robot of Universal Robots `mover` is the same object."""
+    """What tells where the arm is. Of a robot of Universal Robots it is the `link` of `mover`."""
     camera: Camera
     source: Source
     """`real` only when both arm and camera are real."""

@@ -12,8 +12,8 @@ From a person to the wire, by files and functions in `station/` (tests/test_page
   In the daemon: approval and run end, the state is STOPPED, the arm is stopped.
     `server/stop_server.py:StopServer._woken, _read, _carry_out`,
     `server/dispatch.py:SessionDispatcher.stop_by_datagram`, `session/session.py:Session.stop, _halt,
-    _stop_arm`, `devices/ur/robot.py:UrRobot.stop`. The socket is also read at the beginning of every round
-    of the session: `session/supervisor.py:SessionSupervisor._round`,
+    _stop_arm`, `devices/ur/robot.py:UrRobot.stop, StopPaths.stop`. The socket is also read at the beginning
+    of every round of the session: `session/supervisor.py:SessionSupervisor._round`,
     `server/stop_server.py:StopServer.round`.
   From there by two ways at once; neither waits for the other:
     The robot's dashboard: b"stop\\n" to port 29999, also where the station has no control.
@@ -25,7 +25,7 @@ From a person to the wire, by files and functions in `station/` (tests/test_page
   Where the dashboard does not answer "Stopped" within 50 ms it is asked once more, on a new connection. The
     control process is killed once it answered, at most 0.1 s after STOP; a program that it left playing is
     stopped.
-    `devices/ur/robot.py:UrRobot._finish_stop, _dashboard_stop_anew, _stop_leftover_program`.
+    `devices/ur/robot.py:StopPaths._finish_stop, _dashboard_stop_anew, stop_leftover_program`.
   Where the daemon hangs, no way above is left. Its session beats no more, the control process resets the
     watchdog of the program at the controller only for a beat of the last 0.1 s, and 0.2 s after the last one
     the watchdog stops the arm (decision 0045).

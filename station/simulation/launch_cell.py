@@ -63,11 +63,11 @@ def simulated_cell(
         else:
             camera = RenderedCamera(truth, config.robot.host, config.camera)
         started = ends.pop_all()
-    arm = UrRobot(config.robot, folder)
+    driver = UrRobot(config.robot, folder)
     return Cell(
         config=config,
-        arm=arm,
-        mover=arm,
+        arm=driver.link,
+        mover=driver,
         camera=camera,
         source="simulated",
         config_path=path,

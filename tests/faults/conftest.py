@@ -50,7 +50,7 @@ class Cell:
             await asyncio.sleep(BEAT_S)
 
     async def end(self) -> None:
-        await self.robot.close()
+        await self.robot.link.close()
         self._heart.cancel()
         self._admin.close()
 
@@ -85,7 +85,7 @@ class Cell:
 
     def seen(self) -> RobotState:
         """The newest state that reached the driver, however old."""
-        return self.robot.sample(math.inf, connected=False).state
+        return self.robot.link.states.sample(math.inf, connected=False).state
 
     def near(self, joint: int = 5, by_rad: float = 0.02) -> list[float]:
         goal = list(self.seen().joints_rad)
@@ -197,7 +197,7 @@ async def cell(
         robot = UrRobot(RobotConfig(model=model, host=running.host, control=control_path), tmp_path / "log")
         made = Cell(running, robot, request.node.name)
         cells.append(made)
-        await robot.connect()
+        await robot.link.connect()
         if control:
             await made.begin()
         return made

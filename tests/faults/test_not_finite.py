@@ -11,7 +11,7 @@ from station.cell.errors import StaleStateError
 from station.cell.stillness import fastest_rad_s
 from station.devices.ur import UrRobot
 from station.devices.ur.moves import MoveWatch
-from station.devices.ur.state import Payload
+from station.devices.ur.stream import Payload
 from station.devices.ur.tool import check_payload
 from station.session.motion import require_start
 from tests.codes import raises
@@ -27,7 +27,7 @@ OUTPUTS = ["timestamp", "actual_q", "actual_qd", "target_q", "actual_TCP_pose", 
 def told(robot: UrRobot) -> str:
     """Name what is wrong with the arm's news; empty: nothing."""
     try:
-        robot.state()
+        robot.link.state()
     except StaleStateError as error:
         return error.code
     return ""
@@ -41,30 +41,30 @@ async def test_in_mid_move_they_stop_the_arm_and_are_named(cell: MakeCell, outpu
     assert told(c.robot) == "state-not-finite"
     await c.ask("spoil", outputs=[])
     await until(lambda: not told(c.robot))
-    assert math.isfinite(fastest_rad_s(c.robot.state()))
+    assert math.isfinite(fastest_rad_s(c.robot.link.state()))
 
 
 async def test_at_rest_they_are_no_news_and_end_as_they_began(cell: MakeCell) -> None:
     c = await cell(control=False)
-    before = c.robot.state().joints_rad
+    before = c.robot.link.state().joints_rad
     seen: list[float] = []
-    c.robot.subscribe(lambda state: seen.extend(state.joints_rad))
+    c.robot.link.subscribe(lambda state: seen.extend(state.joints_rad))
     await c.ask("spoil", outputs=["actual_q"])
     await until(lambda: told(c.robot) == "state-not-finite")
     await c.ask("spoil", outputs=[])
     await until(lambda: not told(c.robot))
-    assert c.robot.state().joints_rad == pytest.approx(before)
+    assert c.robot.link.state().joints_rad == pytest.approx(before)
     assert all(map(math.isfinite, seen))
 
 
 async def test_an_arm_that_tells_nothing_finite_from_the_begin_is_not_connected(cell: MakeCell) -> None:
     c = await cell(control=False)
-    await c.robot.close()
+    await c.robot.link.close()
     await c.ask("spoil", outputs=["actual_TCP_pose"])
     with raises("state-not-finite"):
-        await c.robot.connect()
+        await c.robot.link.connect()
     await c.ask("spoil", outputs=[])
-    await c.robot.connect()
+    await c.robot.link.connect()
 
 
 NAN_JOINTS = [(*(0.0,) * at, math.nan, *(0.0,) * (5 - at)) for at in range(6)]

@@ -31,7 +31,7 @@ CREPT_RAD = 5e-5
 def rests(robot: UrRobot) -> bool:
     """Tell whether the newest state says that the arm rests, as the daemon decides it after STOP."""
     try:
-        state = robot.state()
+        state = robot.link.state()
     except RobotError:
         return False
     return fastest_rad_s(state) <= RESTING_RAD_S and robot.after_stop(state)
@@ -47,7 +47,7 @@ async def test_rest_is_told_by_the_controllers_clock(
         robot = UrRobot(RobotConfig(model="UR10e", host=host, control=control_path), tmp_path / "log")
         c = Cell(running, robot, f"rest told {seed}")
         try:
-            await robot.connect()
+            await robot.link.connect()
             await c.begin()
             move = asyncio.create_task(robot.move(c.near(0, FAR_RAD), 1.0, 1.5))
             await c.until(lambda state: state["moving"])  # by the controller's own account, without a delay
@@ -75,7 +75,7 @@ async def test_a_stop_that_nothing_confirms_counts_as_arrived_once_the_watchdog_
     robot = UrRobot(RobotConfig(model="UR10", host=running.host, control="script"), tmp_path / "log")
     c = Cell(running, robot, "unconfirmed")
     try:
-        await robot.connect()
+        await robot.link.connect()
         await c.begin()
         await c.cruising()
         await c.ask("mute", ports=["dashboard"])

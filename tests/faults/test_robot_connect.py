@@ -42,7 +42,7 @@ def robot_at(host: str, folder: Path, **config: Any) -> UrRobot:
 
 def complaint(robot: UrRobot) -> ErrorData | None:
     try:
-        robot.check(robot.state())
+        robot.link.check(robot.link.state())
     except RobotError as error:
         return error.data
     return None
@@ -54,7 +54,7 @@ never_driven = pytest.mark.parametrize("control_path", ["script"])
 
 async def test_nobody_is_there(tmp_path: Path) -> None:
     with raises("dashboard"):
-        await robot_at("127.255.3.9", tmp_path).connect()
+        await robot_at("127.255.3.9", tmp_path).link.connect()
 
 
 @pytest.mark.parametrize(
@@ -77,10 +77,10 @@ async def test_a_silent_controller_does_not_hang_the_station(
         robot = robot_at(arm.host, tmp_path)
         with raises(code):
             async with asyncio.timeout(PATIENCE_S):
-                await robot.connect()
+                await robot.link.connect()
         admin.ask(**fault, on=False)
-        await robot.connect()  # nothing is left over from the failure
-        await robot.close()
+        await robot.link.connect()  # nothing is left over from the failure
+        await robot.link.close()
 
 
 async def test_no_tool_is_taken_from_a_controller_that_is_still_starting(
@@ -91,19 +91,19 @@ async def test_no_tool_is_taken_from_a_controller_that_is_still_starting(
         admin.ask("power_off")  # in place of booting, which the simulator does not show
         patch.setattr("station.devices.ur.link.STARTING", (RobotMode.POWER_OFF,))
         with raises("not-powered"):
-            await robot.connect()
-    await robot.connect()
-    await robot.close()
+            await robot.link.connect()
+    await robot.link.connect()
+    await robot.link.close()
 
 
 async def test_one_owner(arm: SimulatedController, tmp_path: Path) -> None:
     first, second = robot_at(arm.host, tmp_path), robot_at(arm.host, tmp_path)
-    await first.connect()
+    await first.link.connect()
     with raises("robot-owned"):
-        await second.connect()
-    await first.close()
-    await second.connect()
-    await second.close()
+        await second.link.connect()
+    await first.link.close()
+    await second.link.connect()
+    await second.link.close()
 
 
 @never_driven
@@ -176,17 +176,17 @@ async def test_old_news_is_not_taken_for_new(cell: MakeCell, fault: dict[str, An
     await c.ask(**fault)
     await asyncio.sleep(0.15)
     with pytest.raises(StaleStateError):
-        c.robot.state()
+        c.robot.link.state()
     await c.ask(**fault, on=False)
-    await until(lambda: c.robot.age_s() < 0.05)
-    c.robot.state()
+    await until(lambda: c.robot.link.states.age_s() < 0.05)
+    c.robot.link.state()
 
 
 async def test_the_link_comes_back_by_itself_but_control_does_not(cell: MakeCell) -> None:
     c = await cell()
     await c.ask("drop")
     await until(lambda: not c.robot.control)
-    await until(lambda: c.robot.age_s() < 0.05)
+    await until(lambda: c.robot.link.states.age_s() < 0.05)
     await c.stays_at_rest()
     await c.begin()
     await c.arrives(c.near())
@@ -204,7 +204,7 @@ CHANGES: dict[str, tuple[Any, Any]] = {
 @pytest.mark.parametrize("code", CHANGES)
 async def test_tcp_or_payload_changed_on_the_pendant(cell: MakeCell, code: str) -> None:
     c, (change, back) = await cell(), CHANGES[code]
-    c.robot.check(c.robot.state())
+    c.robot.link.check(c.robot.link.state())
     await c.ask(**change)
     await until(lambda: (told := complaint(c.robot)) is not None and told.code == code)
     told = complaint(c.robot)
@@ -218,10 +218,10 @@ async def test_tcp_or_payload_changed_on_the_pendant(cell: MakeCell, code: str) 
 
 async def test_a_tool_on_the_pendant_is_reported_and_not_mixed_in(cell: MakeCell) -> None:
     c = await cell(control=False)
-    await c.robot.close()
+    await c.robot.link.close()
     await c.ask("tcp", pose=[0.01, -0.02, 0.15, 0.0, 0.0, 0.5])
     await asyncio.sleep(0.1)
-    identity = await c.robot.connect()
+    identity = await c.robot.link.connect()
     assert identity.tcp_offset == pytest.approx((0.01, -0.02, 0.15, 0.0, 0.0, 0.5), abs=1e-6)
     await c.begin()  # reads the offset from the controller and compares
 
@@ -239,7 +239,7 @@ async def test_safety_stop_between_moves_ends_control(cell: MakeCell) -> None:
     await c.ask("estop")
     await until(lambda: not c.robot.control)
     with raises("emergency-stop"):
-        c.robot.check(c.robot.state())
+        c.robot.link.check(c.robot.link.state())
 
 
 async def test_a_daemon_that_died_leaves_no_lock(arm: SimulatedController, tmp_path: Path) -> None:
@@ -257,8 +257,8 @@ async def test_a_daemon_that_died_leaves_no_lock(arm: SimulatedController, tmp_p
         assert holder.stdout.readline() == b"held\n"
         robot = robot_at(arm.host, tmp_path)
         with pytest.raises(RobotError, match=f"pid {holder.pid}"):
-            await robot.connect()
+            await robot.link.connect()
         holder.kill()
         holder.wait()
-        await robot.connect()
-        await robot.close()
+        await robot.link.connect()
+        await robot.link.close()

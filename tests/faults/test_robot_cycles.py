@@ -40,8 +40,8 @@ def memory_mb() -> float:
 
 async def drop(c: Cell, how: str) -> None:
     """Asks again when the drop came before the controller had accepted the link that just came back."""
-    reader, begun_s, asked_s = c.robot.reader, time.monotonic(), 0.0
-    while reader is not None and c.robot.reader is reader and reader.ended is None:
+    reader, begun_s, asked_s = c.robot.link.states.reader, time.monotonic(), 0.0
+    while reader is not None and c.robot.link.states.reader is reader and reader.ended is None:
         assert time.monotonic() - begun_s < PATIENCE_S, "the robot's loss was not noticed"
         if time.monotonic() - asked_s > 1.0:
             asked_s = time.monotonic()
@@ -60,8 +60,8 @@ async def cycle(c: Cell, number: int) -> None:
     if move is not None:
         with pytest.raises(RobotError):
             await asyncio.wait_for(move, PATIENCE_S)
-    await until(lambda: c.robot.connected and not c.robot.control)
-    await asyncio.wait_for(c.robot.idle(), PATIENCE_S)
+    await until(lambda: c.robot.link.states.connected and not c.robot.control)
+    await asyncio.wait_for(c.robot.stops.idle(), PATIENCE_S)
 
 
 async def run_cycles(c: Cell, count: int) -> None:
@@ -96,7 +96,7 @@ async def test_a_thousand_cycles(cell: MakeCell) -> None:
 async def test_ten_minutes_at_full_rate_without_a_lost_sample(
     controller: Callable[..., SimulatedController],
 ) -> None:
-    from station.devices.ur.state import StateReader
+    from station.devices.ur.stream import StateReader
 
     seconds: float = 600
     count, skipped, before_s = 0, 0, 0.0

@@ -13,7 +13,6 @@ import pytest
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.base import wait_for_state
 from station.devices.news import Delay
-from station.devices.ur import UrRobot
 from station.devices.ur.child import ControlChild
 from tests.codes import raises
 from tests.faults.conftest import Cell, MakeCell, child_gets
@@ -80,7 +79,7 @@ async def test_fault(cell: MakeCell, name: str) -> None:
     assert error.code == code or late_too, error
     if code == "stale-state":
         await c.ask(**fault, on=False)
-    await until(lambda: c.robot.age_s() < 0.1)
+    await until(lambda: c.robot.link.states.age_s() < 0.1)
     await c.until(lambda state: state["program"] is None)  # ur_rtde loads its program anew by itself
     await c.stays_at_rest(1.0 if code == "link-lost" else 0.2)
     with pytest.raises(ProcessLookupError):
@@ -92,8 +91,8 @@ async def test_a_connection_heard_of_as_lost_only_later_is_what_is_told(
 ) -> None:
     """The control process loses its own connection first: then nothing resets the watchdog any more."""
 
-    async def heard_meanwhile(link: UrRobot, *_: object) -> RobotError:
-        link.on_link_lost("the robot closed the connection")
+    async def heard_meanwhile(*_: object) -> RobotError:
+        c.robot.on_link_lost("the robot closed the connection")
         return StaleStateError(Delay.COMPUTER)
 
     c = await cell()
@@ -128,7 +127,7 @@ async def test_a_refused_kick_is_told_as_what_is_behind_it(
 
 async def test_the_switch_to_local_is_named_although_the_supervision_saw_it_first(cell: MakeCell) -> None:
     async def go_local(c: Cell) -> None:
-        c.robot.remote = False
+        c.robot.link.remote = False
         await c.ask("remote", on=False)
 
     assert (await (await cell("UR10e")).strike(go_local)).code == "local-control"
@@ -191,9 +190,9 @@ async def test_control_that_ended_between_two_moves_is_no_trouble_once_it_was_to
     os.kill(control_pid, signal.SIGSTOP)
     await until(lambda: c.robot._ended_by is not None)
     with pytest.raises(RobotError):
-        await wait_for_state(c.robot, checked=True)
+        await wait_for_state(c.robot.link, checked=True)
     await c.robot.end_control()
-    await wait_for_state(c.robot, checked=True)
+    await wait_for_state(c.robot.link, checked=True)
     await c.begin()
 
 

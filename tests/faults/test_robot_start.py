@@ -11,7 +11,7 @@ import pytest
 
 from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
-from station.devices.ur.state import StateReader
+from station.devices.ur.stream import StateReader
 from tests.codes import raises
 from tests.faults.conftest import Cell, MakeCell, child_gets
 from tests.patience import PATIENCE_S, until
@@ -32,7 +32,7 @@ async def unheard(cell: MakeCell, model: str = "UR10") -> tuple[Cell, asyncio.Ta
 
 async def gone(c: Cell) -> None:
     """Nothing of control is left, and nothing moved."""
-    await c.robot.idle()
+    await c.robot.stops.idle()
     assert not c.robot.control and c.control_pid is None
     await c.stays_at_rest()
     assert await c.asked("move") == 0
@@ -41,8 +41,8 @@ async def gone(c: Cell) -> None:
 def is_well(robot: UrRobot) -> bool:
     """The link is back, the dashboard's too."""
     with suppress(RobotError):
-        robot.check(robot.state())
-        return robot.connected
+        robot.link.check(robot.link.state())
+        return robot.link.states.connected
     return False
 
 
@@ -120,7 +120,7 @@ async def test_before_the_first_heartbeat(cell: MakeCell, name: str) -> None:
     assert ended.value.code in (code, *(["controller-late"] if code == "program-ended" else []))
     if name == "cable pulled":
         # Nobody could tell the controller: its program waits, moves nothing, and is not silently replaced.
-        await c.robot.idle()
+        await c.robot.stops.idle()
         await c.ask("black_hole", on=False)
         await until(lambda: is_well(c.robot))
         with raises("foreign-program"):

@@ -42,9 +42,9 @@ async def test_with_a_hung_child_the_dashboard_stops_the_arm(
 
     move, loop = await c.cruising(), asyncio.get_running_loop()
     if silent:
-        monkeypatch.setattr(c.robot.dashboard, "send", lambda command: loop.create_future())
+        monkeypatch.setattr(c.robot.link.dashboard, "send", lambda command: loop.create_future())
     else:
-        monkeypatch.setattr(c.robot, "_dashboard_stop_anew", no_other)
+        monkeypatch.setattr(c.robot.stops, "_dashboard_stop_anew", no_other)
     os.kill(c.control_pid, signal.SIGSTOP)
     await c.robot.stop("operator")
     await c.stops()
@@ -67,14 +67,14 @@ async def test_with_a_silent_dashboard_the_child_stops_the_arm(cell: MakeCell) -
 async def test_stop_is_welcome_in_any_state(cell: MakeCell, tmp_path: Path) -> None:
     stranger = UrRobot(RobotConfig(host="127.255.3.9"), tmp_path / "log")
     await stranger.stop("never connected")
-    await stranger.close()
+    await stranger.link.close()
     c = await cell(control=False)
     await c.robot.stop("no control")
     await c.begin()
     await asyncio.gather(*(c.robot.stop(f"number {i}") for i in range(5)))
     await c.robot.stop("again")
     await c.stays_at_rest()
-    await c.robot.close()
+    await c.robot.link.close()
     await c.robot.stop("closed")
 
 

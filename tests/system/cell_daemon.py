@@ -70,11 +70,11 @@ def main() -> None:
     place, hangs = Path(root), os.environ.get("CELL_HANGS", "")
     if hangs == "disk":
         let_the_disk_hang()
-    arm = UrRobot(config.robot, place)
+    driver = UrRobot(config.robot, place)
     cell = Cell(
         config=config,
-        arm=arm,
-        mover=arm,
+        arm=driver.link,
+        mover=driver,
         camera=(HangingCamera if hangs == "camera" else RenderedCamera)(truth, host, config.camera),
         source="real" if os.environ.get("CELL_SOURCE") == "real" else "simulated",
         attachments={"truth.json": Path(truth_file).read_bytes()},

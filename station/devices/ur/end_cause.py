@@ -19,7 +19,7 @@ from station.devices.rtde import RuntimeState
 from station.devices.ur.child import ControlChild
 from station.devices.ur.condition import arm_held, program_ended
 from station.devices.ur.link import UrLink
-from station.devices.ur.state import POLL_S
+from station.devices.ur.stream import POLL_S
 
 OUTLIVED_S = 0.6
 """If the control program still plays so long after a pause of this computer began, that pause did not stop
@@ -40,8 +40,8 @@ async def cause_of_end(link: UrLink, child: ControlChild, error: RobotError) -> 
         return error
     begun_s, late = time.monotonic(), error.code == StaleStateError.code
     ended = error.code in ("program-ended", "watchdog")
-    after = await link.state_after(begun_s, RESTING_S if late else NEWS_WAIT_S if ended else 0.0)
-    states = link.states()
+    after = await link.states.state_after(begun_s, RESTING_S if late else NEWS_WAIT_S if ended else 0.0)
+    states = link.states.history()
     if states and (held := arm_held(states[-1])) is not None:
         return held
     if link.remote and link.dashboard is not None:
@@ -55,7 +55,7 @@ async def cause_of_end(link: UrLink, child: ControlChild, error: RobotError) -> 
         if other is not None:
             return RobotError("program-replaced", program=other, called=f" ({other})" if other else "")
     if late and after is not None:
-        return link.evidence(0.0, begun_s - OUTLIVED_S, time.monotonic()).error() or error
+        return link.states.evidence(0.0, begun_s - OUTLIVED_S, time.monotonic()).error() or error
     if not ended:
         return error
     if any(
@@ -72,7 +72,7 @@ def _evidence_of_end(link: UrLink, child: ControlChild, states: Sequence[RobotSt
     """Measure what was late before the control program ended."""
     until_s = _program_end_s(states, child.started_s) or time.monotonic()
     since_s = until_s - OUTLIVED_S
-    return link.evidence(longest_silence_s(child.kicks_s, since_s, until_s), since_s, until_s)
+    return link.states.evidence(longest_silence_s(child.kicks_s, since_s, until_s), since_s, until_s)
 
 
 def _program_end_s(states: Sequence[RobotState], since_s: float) -> float | None:
@@ -92,9 +92,9 @@ async def _other_program(link: UrLink, since_s: float, wait_s: float) -> str | N
     """
     give_up_s = time.monotonic() + wait_s
     while True:
-        if (name := link.program_started) and name not in OUR_PROGRAMS:
+        if (name := link.tool.program_started) and name not in OUR_PROGRAMS:
             return name
-        states = link.states()
+        states = link.states.history()
         ended = _program_end_s(states, since_s) is not None
         if not name and ended and states[-1].runtime_state == RuntimeState.PLAYING:
             return ""

@@ -17,7 +17,7 @@ import contextlib
 import logging
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -30,7 +30,7 @@ from station.cell.config import vector6
 from station.cell.errors import RobotError
 from station.cell.layout import pose_vector
 from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
-from station.devices.ur.state import Payload
+from station.devices.ur.stream import Payload, Sample
 
 log = logging.getLogger(__name__)
 
@@ -251,6 +251,98 @@ class TcpCheck:
             _compare(_pose(offset), _pose(self.offset), tolerance, code, self._model.name)
         now = _flange_from_tcp(self._model, state)
         _compare(now, self._first, _widened(self._tolerance, state), "tcp-changed", self._model.name)
+
+
+class Tool:
+    """What is on the flange, as it was taken at connect: TCP offset, the kinematics behind it, payload.
+
+    It holds over lost connections, until `forget`. `calibrated`: the model's kinematics are the configured
+    ones of this arm.
+    """
+
+    def __init__(self, host: str, model: RobotModel, calibrated: bool) -> None:
+        self._host = host
+        self._model = model
+        self._calibrated = calibrated
+        self._primary: PrimaryReader | None = None
+        self._tcp: TcpCheck | None = None
+        self._payload: Payload | None = None
+        self.relied_on = False
+        """A picture or a motion relies on the TCP offset taken at connect."""
+
+    async def open(self) -> Installation:
+        """Begin to read what the controller states; return its first statement, which may be empty."""
+        self._primary = PrimaryReader(self._host)
+        return await self._primary.first()
+
+    async def close(self) -> None:
+        """End the connection; what was taken stays."""
+        primary, self._primary = self._primary, None
+        if primary is not None:
+            await primary.close()
+
+    def forget(self) -> None:
+        self._tcp = None
+        self._payload = None
+        self.relied_on = False
+
+    def take(self, first: Sample, stated: Installation) -> None:
+        """Take the tool of a new connection, or hold it against the one taken before. Raises RobotError."""
+        if self._payload is None:
+            self._payload = first.payload
+        if self._tcp is None:
+            self._tcp = self._checked(first.state, stated)
+        else:
+            self._tcp.check(first.state, stated)
+
+    def take_late_offset(self, state: Callable[[], RobotState]) -> bool:
+        """Take the TCP offset that the controller states after connecting, where nothing relies on ours.
+
+        `state`: asks for the arm's. True: it was taken.
+        """
+        told = self._primary.installation if self._primary is not None else Installation()
+        if told.tcp_offset is None or self._tcp is None or self._tcp.stated or self.relied_on:
+            return False
+        self._tcp = self._checked(state(), told)
+        return True
+
+    def _checked(self, state: RobotState, stated: Installation) -> TcpCheck:
+        return TcpCheck(self._model, self._calibrated, state, stated)
+
+    def check(self, sample: Sample) -> None:
+        """Raise RobotError when TCP or payload differ from those at connect; works in motion, too."""
+        if self._tcp is not None and self._primary is not None:
+            self._tcp.check(sample.state, self._primary.installation)
+        if self._payload is not None:
+            check_payload(sample.payload, self._payload)
+
+    def agree(self, stated: Vector6) -> None:
+        """Raise RobotError unless the offset that the control program reads is the one taken at connect."""
+        if self._tcp is not None:
+            self._tcp.agree(stated)
+
+    @property
+    def offset(self) -> Vector6:
+        """flange_from_tcp: x y z [m], rotation vector [rad]; zero before it is taken."""
+        return self._tcp.offset if self._tcp is not None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def kinematics(self) -> ArmKinematics | None:
+        return self._tcp.kinematics if self._tcp is not None else None
+
+    @property
+    def payload(self) -> tuple[float, ...]:
+        """Mass (kg) and centre (m, in `flange`) at connect; empty: not reported."""
+        return (self._payload.mass_kg, *self._payload.centre_m) if self._payload is not None else ()
+
+    @property
+    def program_started(self) -> str:
+        """Name of the program that started last, as far as the robot told."""
+        return self._primary.started if self._primary is not None else ""
+
+    def forget_program(self) -> None:
+        if self._primary is not None:
+            self._primary.started = ""
 
 
 def check_payload(now: Payload, first: Payload) -> None:

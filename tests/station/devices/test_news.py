@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -12,8 +13,8 @@ import pytest
 
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.config import RobotConfig
-from station.cell.errors import StaleStateError
-from station.devices.base import wait_for_state
+from station.cell.errors import RobotError, StaleStateError
+from station.devices.base import look_at, wait_for_state
 from station.devices.news import Delay, Evidence, is_loopback, largest_gap, longest_silence_s
 from station.devices.rtde import RuntimeState
 from station.devices.ur.condition import program_ended
@@ -34,12 +35,12 @@ class Reader:
     def __init__(self, made: Any, age_s: float, *, unread: bool = False, ended: str | None = None) -> None:
         self.ended, self._unread, self._link = ended, unread, made
         self.stands_still = self.not_finite = False
-        made.reader = self
+        made.states.reader = self
         self._come(age_s)
 
     def _come(self, age_s: float) -> None:
         self.newest = SimpleNamespace(state=arrived(time.monotonic() - age_s))
-        self._link._deliver(self.newest.state)
+        self._link.states.deliver(self.newest.state)
 
     def read(self) -> None:
         if self._unread:
@@ -80,16 +81,49 @@ def test_late_news_are_waited_for_longer_at_rest_after_what_came_was_read(
     assert said != "stale-state" or age_s <= overdue.values["age_s"] < age_s + 0.2
 
 
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize(("age_s", "largest_s"), [(0.3, 5.0), (5.0, 9.0), (5.0, math.inf), (0.02, 0.1)])
+def test_who_asks_says_how_old_the_state_may_be(age_s: float, largest_s: float, moving: bool) -> None:
+    made = link(age_s, moving=moving)
+    assert made.state(largest_s).stamps.host_monotonic_ns <= time.monotonic_ns() - age_s * 1e9
+    with raises("stale-state") as told:
+        made.state(age_s / 2)
+    assert told.value.values["limit_s"] == age_s / 2
+
+
+def test_who_captures_asks_whether_the_arm_may_be_captured_and_who_only_looks_does_not() -> None:
+    made: Any = link(0.05)
+    made.check = Mock(side_effect=[True, False, RobotError("no-host")])
+    assert look_at(made, checked=True)
+    assert look_at(made, checked=True) is None, "that is not known yet"
+    with raises("no-host"):
+        look_at(made, checked=True)
+    assert look_at(made)
+
+
+def test_a_state_of_a_connection_that_ended_is_given_only_where_it_is_asked_for() -> None:
+    made = link(0.05, ended="reset")
+    with raises("link-lost"):
+        made.state(5.0)
+    assert made.states.sample(5.0, connected=False).state
+
+
+async def test_what_came_after_a_moment_is_not_what_came_before_it() -> None:
+    made = link(0.5, ended="reset")
+    now_s = time.monotonic()
+    assert await made.states.state_after(now_s - 1.0, 9.0) is not None
+    assert await made.states.state_after(now_s - 0.4, 0.45) is None
+
+
 def test_a_resting_arm_waits_for_its_dashboard_from_when_news_are_back() -> None:
     """The cable was out: the dashboard's trouble is old, and it can be asked again only now."""
     late: Any = link(0.0)
     late._trouble, late._trouble_since_s = DashboardError(), time.monotonic() - 5.0
-    late._tool = late._payload = None
     for age_s in (3.0, 0.0):
-        late._deliver(arrived(time.monotonic() - age_s))
+        late.states.deliver(arrived(time.monotonic() - age_s))
     assert not late.check(late.state())
-    late._trouble_since_s -= 1.1
-    late._deliver(arrived(time.monotonic()))
+    late.states.back_s -= 1.1
+    late.states.deliver(arrived(time.monotonic()))
     with raises("dashboard"):
         late.check(late.state())
 
@@ -138,7 +172,7 @@ def test_a_link_tells_what_made_its_news_late(host: str, clock_s: float, blamed:
     made: Any = UrLink(RobotConfig(model="UR10", host=host))
     now_s = time.monotonic()
     history = [arrived(now_s - 0.6, 1.0), arrived(now_s - 0.1, clock_s)]
-    made.reader = SimpleNamespace(history=history, rate_hz=50.0)
+    made.states.reader = SimpleNamespace(history=history, rate_hz=50.0)
     told = made.delay(0.0, now_s - 0.6)
     assert told.code == blamed and told.values["late_ms"] == pytest.approx(500.0)
     assert made.delay(0.0, now_s) is None
@@ -171,7 +205,7 @@ async def test_what_was_late_ends_a_program_but_only_a_person_pauses_it(
     made: Any = UrLink(RobotConfig(model="UR10", host="127.0.0.1"))
     now_s = time.monotonic()
     ended = msgspec.structs.replace(arrived(now_s), runtime_state=state)
-    made.reader = SimpleNamespace(
+    made.states.reader = SimpleNamespace(
         history=[arrived(now_s - 0.4), arrived(now_s - 0.1), ended], rate_hz=125.0, newest=None
     )
     child: Any = SimpleNamespace(started_s=now_s - 9.0, kicks_s=[now_s - 0.05 * k for k in range(20, 0, -1)])

@@ -39,8 +39,8 @@ def test_a_listener_that_fails_is_dropped_alone(link: Any) -> None:
 
     for listener in (lambda state: heard.append("first"), fails, lambda state: heard.append("last")):
         link.subscribe(listener)
-    link._deliver(PLAYING)
-    link._deliver(PLAYING)
+    link.states.deliver(PLAYING)
+    link.states.deliver(PLAYING)
     assert heard == ["first", "fails", "last", "first", "last"]
 
 
@@ -76,11 +76,33 @@ async def test_a_dashboard_that_is_gone_is_opened_again(link: Any, dead: Any) ->
         link.dashboard = SimpleNamespace(alive=True)
 
     link.dashboard, link.renew_dashboard = dead, opened
-    await link.supervise_more()
+    await link.supervise()
     assert link.dashboard.alive
     kept = link.dashboard
-    await link.supervise_more()
+    await link.supervise()
     assert link.dashboard is kept
+
+
+async def test_a_driver_is_told_what_its_link_sees_and_ends_while_the_link_is_open() -> None:
+    log: list[str] = []
+
+    async def note(what: str) -> None:
+        log.append(what)
+
+    dashboard: Any = SimpleNamespace(alive=True, remote=lambda: note("remote"), close=lambda: note("link"))
+    driver: Any = SimpleNamespace(
+        in_motion=True,
+        notice="slow",
+        on_link_lost=log.append,
+        supervise=lambda: note("driver looks"),
+        close=lambda: note("driver"),
+    )
+    link = UrLink(CONFIG, driver)
+    link.dashboard, link.remote = dashboard, True
+    assert link.in_motion and link.notice == "slow"
+    await link.supervise()
+    await link.close()
+    assert log == ["remote", "driver looks", "driver", "link"]
 
 
 async def test_who_connects_twice_opens_one_link_and_a_closed_one_stays_closed(link: Any) -> None:

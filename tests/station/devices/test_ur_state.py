@@ -14,7 +14,7 @@ from recordings.schema.messages import RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import StationError
 from station.devices.ur.link import UrLink
-from station.devices.ur.state import StateReader
+from station.devices.ur.stream import StateReader
 from station.simulation.launch import AdminClient, SimulatedController
 from tests.codes import raises
 from tests.patience import until

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from station.devices.ur.state import _TIMESPEC, SO_TIMESTAMPNS, StateReader
+from station.devices.ur.stream import _TIMESPEC, SO_TIMESTAMPNS, StateReader
 
 S = 1_000_000_000
 MS = 1_000_000

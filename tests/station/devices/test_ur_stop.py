@@ -58,8 +58,8 @@ async def ways() -> Ways:
 async def robot(ways: Ways, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr("station.devices.ur.robot.LEFTOVER_WAIT_S", 0)
     made: Any = UrRobot(RobotConfig(model="UR10", host="127.0.0.1"), tmp_path)
-    monkeypatch.setattr(made, "_dashboard_stop_anew", ways.anew)
-    made.dashboard, made._child, made.control = ways, ways, True
+    monkeypatch.setattr(made.stops, "_dashboard_stop_anew", ways.anew)
+    made.link.dashboard, made._child, made.control = ways, ways, True
     return made
 
 
@@ -71,13 +71,13 @@ async def test_both_ways_are_taken_before_anything_is_waited_for(robot: Any, way
     ways.reply.set_result("Stopped")
     ways.stop_acknowledged.set_result(None)
     await stopping
-    await robot.idle()
+    await robot.stops.idle()
     assert ways.log[2:] == ["child ends"]
 
 
 async def test_a_dashboard_that_does_not_answer_is_asked_by_a_new_connection(robot: Any, ways: Ways) -> None:
     await robot.stop("STOP by anna")
-    await robot.idle()
+    await robot.stops.idle()
     assert sorted(ways.log[2:]) == ["child ends", "dashboard anew"]
 
 
@@ -88,7 +88,7 @@ async def test_without_control_of_ours_the_dashboard_stops_what_runs(
     robot._child, ways.alive = None, alive
     ways.reply.set_result("Stopped")
     await robot.stop("STOP by anna")
-    await robot.idle()
+    await robot.stops.idle()
     assert ways.log == [f"dashboard {STOP}" if alive else "dashboard anew"]
 
 
@@ -98,7 +98,7 @@ async def test_a_way_that_breaks_in_the_call_costs_neither_the_other_nor_the_end
 ) -> None:
     setattr(ways, broken, Mock(side_effect=RuntimeError("a defect")))
     await robot.stop("STOP by anna")
-    await robot.idle()
+    await robot.stops.idle()
     other = "child stop" if broken == "send" else f"dashboard {STOP}"
     assert ways.log[0] == other and sorted(ways.log[1:]) == ["child ends", "dashboard anew"]
 
@@ -111,7 +111,7 @@ def shows(robot: Any, *states: RuntimeState) -> None:
         await asyncio.sleep(moment_s - time.monotonic())
         return left.pop(0) if left else None
 
-    robot.state_after = state_after
+    robot.link.states.state_after = state_after
 
 
 @pytest.mark.parametrize("ready", [True, False])
@@ -135,7 +135,7 @@ async def test_so_is_one_that_starts_only_after_a_stop(
     shows(robot, RuntimeState.STOPPED, RuntimeState.PLAYING)
     ways.reply.set_result("Stopped")
     await robot.stop("STOP by anna")
-    await robot.idle()
+    await robot.stops.idle()
     assert ways.log[2:] == ["child ends", "dashboard anew"]
 
 
@@ -146,7 +146,7 @@ async def test_control_starts_when_the_last_one_has_ended(
         "station.devices.ur.robot.wait_for_state", looks := AsyncMock(side_effect=RobotError("no-host"))
     )
     robot._child = None
-    robot._later(ways.end())
+    robot.stops.later(ways.end())
     starting = asyncio.create_task(robot.start_control())
     await asyncio.sleep(0.01)
     assert not looks.called
@@ -163,5 +163,5 @@ async def test_an_end_of_control_that_is_cancelled_is_carried_out(robot: Any, wa
         ending.cancel()
         await asyncio.wait({ending})
     ways.ended.set()
-    await robot.idle()
+    await robot.stops.idle()
     assert ways.log == ["child ends", "dashboard anew"]

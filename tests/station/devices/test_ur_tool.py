@@ -153,17 +153,18 @@ async def test_it_is_taken_where_no_picture_and_no_motion_relies_on_the_derived_
     used: str | None, tmp_path: Path
 ) -> None:
     robot: Any = UrRobot(RobotConfig(model="UR10", host="127.0.0.1"), tmp_path)
-    robot._tool = TcpCheck(UR10, False, sample(FACTORY, HERE, TOOL), Installation())
-    robot._primary = SimpleNamespace(installation=stated(FACTORY, TOOL), started="")
-    robot.state, robot.dashboard = (lambda: sample(FACTORY, HERE, TOOL)), SimpleNamespace(alive=True)
-    robot.guided = used == "guided"
+    robot.link.tool._tcp = TcpCheck(UR10, False, sample(FACTORY, HERE, TOOL), Installation())
+    robot.link.tool._primary = SimpleNamespace(installation=stated(FACTORY, TOOL), started="")
+    robot.link.state = lambda: sample(FACTORY, HERE, TOOL)
+    robot.link.dashboard = SimpleNamespace(alive=True)
+    robot.link.guided = used == "guided"
     with suppress(RobotError):
         if used == "at":
-            robot.at(0)
+            robot.link.at(0)
         if used == "start_control":
             await robot.start_control()
-    await robot.supervise_more()
-    assert (robot.identity.tcp_offset == TOOL) is (used is None)
+    await robot.link.supervise()
+    assert (robot.link.identity.tcp_offset == TOOL) is (used is None)
 
 
 async def test_a_controller_that_is_slow_to_state_its_tool_is_waited_for(

@@ -2,9 +2,10 @@
 
 A change competes with what else makes views disagree: an arm whose errors vary smoothly with its posture, and
 single views that are wrong. Both are in the evidence of either side (`linear`), with the sizes of the arm's
-errors and of the change averaged out. So the ratio of the two, a Bayes factor, is at least 1/α in a share of
-at most α of the recordings in which nothing changed (Markov's inequality): one stated probability of a false
-claim is the only threshold.
+errors and of the change averaged out. An arm that changes its configuration, an elbow or a wrist, errs
+differently from then on: a step at the same place, of the size of its other errors, is a rival, too. So the
+ratio of the evidences, a Bayes factor, is at least 1/α in a share of at most α of the recordings in which
+nothing changed (Markov's inequality): one stated probability of a false claim is the only threshold.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ FEWEST_PER_PART = 2
 """Fewest views before and after a change that agree: one alone may as well be a wrong view."""
 FOCAL = 1
 """Index of the focal length among the factors of `pose_views`."""
+_POSE = 6
+"""Numbers of a change of pose; a focal length has one."""
 _SIZES = np.array([0.03, 0.12, 0.48])
 """1σ of the arm's errors, mm and mrad, from what no view can tell from none."""
 _CHANGE_SIZES = 1e-4 * 4.0 ** np.arange(6)
@@ -58,8 +61,11 @@ _MOST_FITS = 3
 """Most fits of one change, each at the place that the one before found better."""
 _AGREES = 0.5
 """Probability of ordinary noise from which a view agrees."""
-_ROUNDS = 4
-"""Rounds of expectation and maximisation for each size of the arm's errors."""
+_ROUNDS = 20
+"""Rounds of expectation and maximisation for each size of the arm's errors. After a few, evidence may be off
+by tens of nats: noise shrinks slowly from that of a fit without errors by posture."""
+_ROUNDS_BESIDE = 6
+"""Rounds at a place, from the noise of the place beside."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +166,10 @@ class _Weighed:
     places: NDArray[np.intp]
     logs: Array
     """Log evidence at each place."""
-    scales: Scales
+    log_step: float
+    """Log evidence, at the best place, of a step as large as the arm's other errors."""
+    log_none: float
+    """Log evidence of no change."""
     apart: Array
     agrees: bool
     """Enough views before and after have ordinary noise."""
@@ -180,7 +189,6 @@ class ChangeSearch:
         self._seed = seed
         self._fit = as_recorded
         state = _State(as_recorded.X[0], as_recorded.Y[0], as_recorded.factors)
-        self._posture = _posture(views.flange)[0]
         self._linear = self._linearised(state)
         self._priors = [self._prior(state.factors, size) for size in _SIZES]
         scales = as_recorded.solved.scales
@@ -193,14 +201,17 @@ class ChangeSearch:
         kinds = [Reading.BOARD_MOVED, Reading.CAMERA_MOVED]
         if len(self._views.boards.sigma) > FOCAL:
             kinds.append(Reading.REFOCUSED)
-        changes = []
+        found: dict[Reading, _Weighed] = {}
         for kind in kinds:
             tried = self._promising(kind, len(kinds))
             if (self._fit.full < 0.5).any():  # views may be taken for wrong ones that followed a change
                 tried += self._apart(kind)
-            weighed = [self._weighed(kind, at, len(kinds)) for at in dict.fromkeys(tried)]
-            changes += sorted((one for one in weighed if one), key=lambda one: -one.log_bayes)[:1]
-        return changes
+            weighed = [one for at in dict.fromkeys(tried) if (one := self._weighed(kind, at))]
+            if weighed:
+                found[kind] = max(weighed, key=lambda one: special.logsumexp(one.logs))
+        steps = [one.log_step - np.log(len(self._places)) for one in found.values()]
+        rivals = [one.log_none for one in found.values()] + steps
+        return [self._change(kind, one, len(kinds), max(rivals)) for kind, one in found.items()]
 
     def _promising(self, kind: Reading, kinds: int) -> list[int]:
         """Find the place that is best beside the fit without a change, where a change may win at all.
@@ -266,7 +277,7 @@ class ChangeSearch:
                     best = gain
         return [best_at] if best_at else []
 
-    def _weighed(self, kind: Reading, at: int, kinds: int) -> Change | None:
+    def _weighed(self, kind: Reading, at: int) -> _Weighed | None:
         """Weigh a change near `at` over all its places; None where too few views agree with it."""
         weighed = None
         for _ in range(_MOST_FITS):
@@ -277,14 +288,14 @@ class ChangeSearch:
             if weighed.best == at:
                 break
             at = weighed.best
-        if weighed is None or not weighed.agrees:
-            return None
+        return weighed if weighed is not None and weighed.agrees else None
+
+    def _change(self, kind: Reading, weighed: _Weighed, kinds: int, log_rival: float) -> Change:
+        """Hold a change against the best of its rivals."""
         chance = np.exp(weighed.logs - special.logsumexp(weighed.logs))
         first, last = _held(chance, int(weighed.logs.argmax()))
         prior = np.log(len(self._places) * kinds)
-        by_posture = self._log_by_posture(kind, weighed.best, weighed.scales) - prior
-        none = max(self._log_none(weighed.scales), by_posture)
-        log_bayes = float(special.logsumexp(weighed.logs) - prior - none)
+        log_bayes = float(special.logsumexp(weighed.logs) - prior - log_rival)
         places = weighed.places
         factor = 1.0 + float(weighed.apart[0]) if kind is Reading.REFOCUSED else 1.0
         return Change(kind, log_bayes, weighed.best, int(places[first]), int(places[last]), factor)
@@ -301,7 +312,10 @@ class ChangeSearch:
         likeliest = solved[int(logs.argmax())]
         prior = _with_change(sides.priors[int(logs.argmax())], count)
         places = self._places[np.abs(self._places - at) <= _NEAREST]
-        beside = [sides.split(int(place)).solve(prior, likeliest.scales, "nothing") for place in places]
+        beside = [
+            sides.split(int(place)).solve(prior, likeliest.scales, "robot", _ROUNDS_BESIDE)
+            for place in places
+        ]
         by_place = np.array([_log_of_change(one, sides.apart) for one in beside])
         # Where the sides were fitted, the sizes of the arm's errors are averaged; elsewhere the evidence
         # differs by as much as for the likeliest size.
@@ -310,7 +324,14 @@ class ChangeSearch:
         by_place += averaged - here
         ordinary = likeliest.chances[:, 0] > _AGREES
         agrees = min(ordinary[:at].sum(), ordinary[at:].sum()) >= FEWEST_PER_PART
-        return _Weighed(places, by_place, likeliest.scales, sides.apart, bool(agrees))
+        # One more term of the arm's errors, as large as those by its posture; no arm changes a focal length.
+        steps = [
+            _log_of_step(one, sides.apart, LINKS * ARM_ERROR_UNIT * size) if count == _POSE else -np.inf
+            for one, size in zip(solved, _SIZES, strict=True)
+        ]
+        log_step = float(special.logsumexp(steps) - np.log(len(steps)))
+        log_none = self._log_none(likeliest.scales)
+        return _Weighed(places, by_place, log_step, log_none, sides.apart, bool(agrees))
 
     def _log_none(self, scales: Scales) -> float:
         """Log evidence of no change, the sizes averaged, from the noise without and with a change."""
@@ -318,21 +339,6 @@ class ChangeSearch:
         logs = [
             max(one.log_evidence, other.log_evidence) for one, other in zip(self._none, again, strict=True)
         ]
-        return float(special.logsumexp(logs) - np.log(len(logs)))
-
-    def _log_by_posture(self, kind: Reading, at: int, scales: Scales) -> float:
-        """Log evidence of an error like the change before view `at`, as far as the posture foretells it.
-
-        Where postures before and after differ, nobody can tell a change from an arm that errs by posture.
-        """
-        terms = np.column_stack([np.ones(len(self._views)), self._posture])
-        later = (np.arange(len(self._views)) >= at).astype(float)
-        foretold = terms @ np.linalg.lstsq(terms, later, rcond=None)[0]
-        change = foretold[:, None, None] * self._linear.J[..., self._columns(kind)]
-        linear = replace(self._linear, J=np.concatenate([self._linear.J, change], axis=2))
-        d = change.shape[2]
-        solved = [linear.solve(_with_change(prior, d), scales, "robot", _ROUNDS) for prior in self._priors]
-        logs = [_log_of_change(one, np.zeros(d)) for one in solved]
         return float(special.logsumexp(logs) - np.log(len(logs)))
 
     @property
@@ -407,6 +413,14 @@ def _log_of_change(solved: LinearSolution, apart: Array) -> float:
     return solved.log_evidence + float(_by_sizes(apart + solved.step[-d:], covariance))
 
 
+def _log_of_step(solved: LinearSolution, apart: Array, sigma: float) -> float:
+    """Compute the same for a step, beside `apart` (6,), whose parts have this 1σ (metres, radians)."""
+    covariance = np.linalg.inv(solved.precision)[-_POSE:, -_POSE:] + sigma**2 * np.eye(_POSE)
+    step = apart + solved.step[-_POSE:]
+    square = float(step @ np.linalg.solve(covariance, step))
+    return solved.log_evidence - 0.5 * (square + float(np.linalg.slogdet(covariance)[1]))
+
+
 def _by_sizes(change: Array, covariance: np.ndarray) -> Array:
     """Compute what a change (..., d) costs, with covariance (..., d, d): its prior over a flat one (...).
 
@@ -414,7 +428,7 @@ def _by_sizes(change: Array, covariance: np.ndarray) -> Array:
     """
     d = change.shape[-1]
     sizes = _CHANGE_SIZES[:, None]
-    if d == 6:
+    if d == _POSE:
         shift, turn = np.meshgrid(_CHANGE_SIZES, _CHANGE_SIZES)
         sizes = np.repeat(np.stack([shift.ravel(), turn.ravel()], axis=1), 3, axis=1)
     total = covariance[..., None, :, :] + sizes[:, :, None] ** 2 * np.eye(d)

@@ -4,56 +4,77 @@ from __future__ import annotations
 
 from recordings.cli.lazy import LazyCommand, LazyGroup
 
-_SOLVE, _FILES = "calibrate.cli.solve", "calibrate.cli.installed"
 COMMANDS = {
     "solve": LazyCommand(
-        f"{_SOLVE}:solve",
+        "calibrate.cli.solve:solve",
+        "Solve a recording and write the calibration file.",
         (
             "calibrate solve session.mcap -o cell.yaml --report cell.html",
             "calibrate solve session.mcap -o cell.yaml --without 3,7",
         ),
     ),
     "compare": LazyCommand(
-        f"{_SOLVE}:compare",
+        "calibrate.cli.solve:compare",
+        "Compare all methods on the same views.",
         ("calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"),
     ),
     "show": LazyCommand(
-        f"{_FILES}:show", ("calibrate show  # the installed one", "calibrate show cell.yaml")
+        "calibrate.cli.installed:show",
+        "Show a calibration: verdict, result, gates, validity.",
+        ("calibrate show  # the installed one", "calibrate show cell.yaml"),
     ),
     "export": LazyCommand(
-        f"{_FILES}:export",
+        "calibrate.cli.installed:export",
+        "Write a calibration in another program's format.",
         (
             "calibrate export --to ros-launch -o camera.launch.py  # of what is installed",
             "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
         ),
     ),
     "install": LazyCommand(
-        f"{_FILES}:install",
+        "calibrate.cli.installed:install",
+        "Make a calibration the installed one.",
         (
             "calibrate install cell.yaml",
             "calibrate install mine.yaml --cell imported --root my-cell  # of your own images",
         ),
     ),
-    "list": LazyCommand(f"{_FILES}:list_installed", ("calibrate list", "calibrate list --root my-cell")),
+    "list": LazyCommand(
+        "calibrate.cli.installed:list_installed",
+        "List every calibration that was installed here.",
+        ("calibrate list", "calibrate list --root my-cell"),
+    ),
     "rollback": LazyCommand(
-        f"{_FILES}:rollback",
+        "calibrate.cli.installed:rollback",
+        "Go back to an older installed calibration.",
         ("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3"),
     ),
     "withdraw": LazyCommand(
-        f"{_FILES}:withdraw", ("calibrate withdraw 'a pallet hit the camera'",), rare=True
+        "calibrate.cli.installed:withdraw",
+        "Take the installed calibration out of use.",
+        ("calibrate withdraw 'a pallet hit the camera'",),
+        rare=True,
     ),
-    "follow": LazyCommand("calibrate.cli.follow:follow", ("calibrate follow --camera overhead",), rare=True),
+    "follow": LazyCommand(
+        "calibrate.cli.follow:follow",
+        "Print the installed calibration as JSON, and again after every change.",
+        ("calibrate follow --camera overhead",),
+        rare=True,
+    ),
     "drift-check": LazyCommand(
         "calibrate.cli.drift_check:drift_check",
+        "Test the installed calibration on new views.",
         ("calibrate drift-check later.mcap", "calibrate drift-check production-pictures --board tag.yaml"),
     ),
     "annotate": LazyCommand(
         "calibrate.cli.annotate:annotate",
+        "Draw a calibration into a recording, for Foxglove, Lichtblick or rerun.",
         ("calibrate annotate session.mcap calibration.yaml -o seen.mcap",),
         rare=True,
     ),
     "board": LazyCommand(
         "calibrate.cli.board:board",
+        "Write a board to print (PDF, SVG) or for a simulator (PNG, PPM).",
         (
             "calibrate board -o board.pdf --paper A4",
             "calibrate board 'charuco 12x9 30 22' -o board.svg",
@@ -62,6 +83,7 @@ COMMANDS = {
     ),
     "batch": LazyCommand(
         "calibrate.cli.batch:batch",
+        "Solve many recordings; resumable.",
         (
             "calibrate batch monday.mcap tuesday.mcap -o results",
             "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",

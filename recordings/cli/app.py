@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from recordings.cli.lazy import LazyCommand, LazyGroup
+from recordings.cli.offered import offered
 
 RECORDINGS = LazyGroup(
     {
         "info": LazyCommand(
             "recordings.cli.commands:info_command",
+            "Show contents, rates and gaps. Exit 3: segment missing.",
             ("recordings info session.mcap", "recordings info SESSION-FOLDER --json"),
         ),
-        "import": LazyCommand(
-            "calibrate.cli.importing:import_command",  # the board in the images judges how poses are read
-            (
-                "recordings import FOLDER -o mine.mcap",
-                "recordings import FOLDER --dry-run  # says what would be taken, and why",
-                "recordings import FOLDER --mount eye-in-hand --convention kuka-abc -o mine.mcap",
-                "recordings import BAG --dataset dataset.yaml --flange tool0 -o mine.mcap",
-            ),
-        ),
+        "import": offered("import"),
         "export": LazyCommand(
             "recordings.cli.commands:export_command",
+            "Write images and poses, or a ROS 2 bag.",
             (
                 "recordings export session.mcap --to folder -o images  # edit, then import",
                 "recordings export session.mcap --to ros2 -o bag",
@@ -28,6 +23,7 @@ RECORDINGS = LazyGroup(
         ),
         "recover": LazyCommand(
             "recordings.cli.commands:recover_command",
+            "Rebuild an unfinished, cut or damaged recording. Exit 3: rebuilt.",
             ("recordings recover session.mcap.part", "recordings recover cut.mcap -o saved.mcap"),
         ),
     },

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import ast
-import importlib.util
+import importlib
 import io
 import os
 import sys
@@ -40,20 +39,12 @@ class LazyCommand(NamedTuple):
 
     where: str
     """`module:function`; the function is declared as typer declares it."""
+    line: str
+    """What it does, as the group's help says it: the first line of the function's docstring."""
     examples: tuple[str, ...] = ()
     """Command lines as a person types them, a remark behind `#`."""
     rare: bool = False
     """Listed by `--all` only."""
-
-    def first_line(self) -> str:
-        """First line of the function's docstring, by its source: importing it may take a second."""
-        module, _, function = self.where.partition(":")
-        found = importlib.util.find_spec(module)
-        assert found is not None and found.origin is not None
-        for node in ast.parse(Path(found.origin).read_bytes()).body:
-            if isinstance(node, ast.FunctionDef) and node.name == function:
-                return (ast.get_docstring(node) or "").partition("\n")[0]
-        return ""
 
     def load(self, name: str) -> TyperCommand:
         """Import the module and declare the command."""
@@ -71,7 +62,7 @@ class LazyGroup(TyperGroup):
 
     def __init__(self, commands: Mapping[str, LazyCommand], help: str, epilog: str) -> None:
         super().__init__(
-            commands={name: TyperCommand(name) for name in commands},
+            commands={name: TyperCommand(name, help=command.line) for name, command in commands.items()},
             help=help,
             epilog=f"{ALL}\n\n{epilog}",
             no_args_is_help=True,
@@ -80,13 +71,6 @@ class LazyGroup(TyperGroup):
             params=_group_options(),
         )
         self._lazy = commands
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a stub, which holds the command's line in the group's help."""
-        stub = super().get_command(ctx, cmd_name)
-        if stub is not None and stub.help is None:
-            stub.help = self._lazy[cmd_name].first_line()
-        return stub
 
     def get_help_option(self, ctx: Any) -> Any:
         """Hide `--help` in the list of options: everybody knows it."""

@@ -8,14 +8,17 @@ STATION = LazyGroup(
     {
         "tui": LazyCommand(
             "station.cli.daemon:tui_command",
+            "Open the operator screen; start a daemon if none runs.",
             ("station tui",),
         ),
         "demo": LazyCommand(
             "station.cli.demo:demo_command",
+            "Run the whole job on a simulated cell: no hardware needed.",
             ("station demo", "station demo --seed 3 --mount eye-to-hand --noise mid --out trial"),
         ),
         "serve": LazyCommand(
             "station.cli.serve:serve_command",
+            "Run the daemon that owns a real, simulated or replayed cell.",
             (
                 "station serve --config station.yaml  # then, in another terminal: station",
                 "station serve --config station.yaml --rehearse  # the same with no hardware",
@@ -25,6 +28,7 @@ STATION = LazyGroup(
         ),
         "plan": LazyCommand(
             "station.cli.plan:plan_command",
+            "Make a pose plan, or check one. Nothing moves.",
             (
                 "station plan --config station.yaml -o plan.yaml  # from where the arm stands",
                 "station plan --config station.yaml --check plan.yaml",
@@ -32,32 +36,65 @@ STATION = LazyGroup(
         ),
         "capture": LazyCommand(
             "station.cli.session:capture_command",
+            "Capture the poses of a plan. Ctrl-C stops the arm.",
             (
                 "station capture --plan plan.yaml",
                 "station capture --plan plan.yaml --headless --approve 0123456789ab",
             ),
         ),
         "status": LazyCommand(
-            "station.cli.requests:status_command", ("station status", "station status --json")
+            "station.cli.requests:status_command",
+            "Show what the station is doing.",
+            ("station status", "station status --json"),
         ),
         "post": LazyCommand(
             "station.cli.post:post_command",
+            "Post the pose of an arm that a person moves (robot.driver: posted).",
             ("python tell_pose.py | station post", "station post --typed kuka-abc"),
             rare=True,
         ),
-        "stop": LazyCommand("station.cli.requests:stop_command", ("station stop",)),
+        "stop": LazyCommand(
+            "station.cli.requests:stop_command", "Stop the arm now (STOP).", ("station stop",)
+        ),
         "acknowledge": LazyCommand(
-            "station.cli.requests:acknowledge_command", ("station acknowledge",), rare=True
+            "station.cli.requests:acknowledge_command",
+            "Leave `stopped` or `fault` after looking at the cell. Nothing moves.",
+            ("station acknowledge",),
+            rare=True,
         ),
-        "pause": LazyCommand("station.cli.requests:pause_command", ("station pause",), rare=True),
-        "resume": LazyCommand("station.cli.session:resume_command", ("station resume",), rare=True),
-        "finish": LazyCommand("station.cli.requests:finish_command", ("station finish",), rare=True),
+        "pause": LazyCommand(
+            "station.cli.requests:pause_command",
+            "Pause after the pose under way.",
+            ("station pause",),
+            rare=True,
+        ),
+        "resume": LazyCommand(
+            "station.cli.session:resume_command",
+            "Continue a paused or interrupted session. Ctrl-C stops the arm.",
+            ("station resume",),
+            rare=True,
+        ),
+        "finish": LazyCommand(
+            "station.cli.requests:finish_command",
+            "Finish the recording with the poses captured so far.",
+            ("station finish",),
+            rare=True,
+        ),
         "retake": LazyCommand(
-            "station.cli.requests:retake_command", ("station retake 7  # then: station resume",), rare=True
+            "station.cli.requests:retake_command",
+            "Mark a pose to be captured again by the next run.",
+            ("station retake 7  # then: station resume",),
+            rare=True,
         ),
-        "skip": LazyCommand("station.cli.requests:skip_command", ("station skip 7",), rare=True),
+        "skip": LazyCommand(
+            "station.cli.requests:skip_command",
+            "Leave a pose out, in later runs of the plan too.",
+            ("station skip 7",),
+            rare=True,
+        ),
         "drift-check": LazyCommand(
             "station.cli.session:drift_check_command",
+            "Check by a few new poses that the calibration holds.",
             (
                 "station drift-check",
                 "station drift-check --plan plan.yaml --headless --approve 0123456789ab",
@@ -65,12 +102,18 @@ STATION = LazyGroup(
         ),
         "accept": LazyCommand(
             "station.cli.accept:accept_command",
+            "Test how the arm stops, in four ways: the watchdog is among them.",
             ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.25"),
             rare=True,
         ),
-        "new": LazyCommand("station.cli.new:new_command", ("station new", "station new -o station.yaml")),
+        "new": LazyCommand(
+            "station.cli.new:new_command",
+            "Set up a cell in a wizard that only reads.",
+            ("station new", "station new -o station.yaml"),
+        ),
         "doctor": LazyCommand(
             "station.cli.requests:doctor_command",
+            "Check what a capture needs; say how to mend what is missing.",
             ("station doctor --example > station.yaml", "station doctor --config station.yaml"),
         ),
     },

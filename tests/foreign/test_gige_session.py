@@ -44,7 +44,7 @@ def arm(lonely_network: None, tmp_path: Path) -> Iterator[SimulatedController]:
 
 
 def configuration(arm: SimulatedController) -> StationConfig:
-    """As of a real cell; how near the emulator's clock is read on busy cores says nothing about the station."""
+    """As of a real cell; how near busy cores read the emulator's clock is not the station's affair."""
     config = cell_config(TRUTH, arm.host)
     return msgspec.structs.replace(
         config,

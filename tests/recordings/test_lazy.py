@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import typer
+
+from recordings.cli.offered import offered
+from tests.codes import raises
 
 
 def run(program: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -49,10 +55,31 @@ def test_a_missing_extra_is_named_in_one_line() -> None:
         "import sys; sys.modules['textual'] = None\n"
         "from recordings.cli.lazy import LazyCommand, LazyGroup, run\n"
         "sys.argv = ['x', 'screen']\n"
-        "run('x', LazyGroup({'screen': LazyCommand('textual.app:App')}, '', ''))"
+        "run('x', LazyGroup({'screen': LazyCommand('textual.app:App', 'a screen')}, '', ''))"
     )
     assert done.returncode == 2
     assert "calibration-station[station]" in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+def test_a_command_whose_package_is_missing_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recordings.cli.offered.entry_points", lambda **kind: [])
+    command = offered("import")
+    assert command.line
+    context = typer.Context(command.load("import"), info_name="recordings import")
+    with raises("command-not-installed", command="recordings import"), context:
+        context.command.parse_args(context, ["FOLDER"])
+        context.command.invoke(context)
+
+
+def test_no_string_here_names_a_module_of_a_package_above() -> None:
+    """Such a string would go round the import contracts, which see imports only."""
+    for path in Path("recordings").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                assert not re.match(r"(calibrate|station)\.\w+(\.\w+)*(:\w+)?$", node.value), (
+                    path,
+                    node.value,
+                )
 
 
 def test_an_error_that_nobody_reads_is_one_line(tmp_path: Path) -> None:

@@ -8,20 +8,24 @@ from typing import Any
 import pytest
 import typer
 
+from calibrate.cli.app import CALIBRATE
+from recordings.cli.app import RECORDINGS
 from recordings.cli.lazy import LazyGroup
 from station.cli.app import STATION
 from tests.command_line import call
 
+GROUPS = (STATION, CALIBRATE, RECORDINGS)
 
-def resolve(*words: str) -> tuple[str, Any, list[str]]:
-    name, command, rest = STATION.resolve_command(typer.Context(STATION), list(words))
+
+def resolve(group: LazyGroup, *words: str) -> tuple[str, Any, list[str]]:
+    name, command, rest = group.resolve_command(typer.Context(group), list(words))
     return name, command, rest
 
 
-@pytest.mark.parametrize("name", STATION.commands)
-def test_a_line_of_the_table_opens_its_commands_help(name: str) -> None:
-    line = STATION.get_command(typer.Context(STATION), name).help
-    assert line == resolve(name)[1].help.splitlines()[0]
+@pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in group.commands])
+def test_a_line_of_the_table_opens_its_commands_help(group: LazyGroup, name: str) -> None:
+    line = group.get_command(typer.Context(group), name).help
+    assert line == resolve(group, name)[1].help.splitlines()[0]
     assert 0 < len(line) <= 72
 
 

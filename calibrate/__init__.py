@@ -24,36 +24,6 @@ remedy names an option of the commands, such as `--board`, it is the argument `b
 at their first use. The solver without files is `calibrate.handeye`. Everything else is private.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from recordings.door import open_door
-
-if TYPE_CHECKING:
-    from calibrate.errors import CalibrationError as CalibrationError
-    from calibrate.files.calibration import Calibration as Calibration
-    from calibrate.files.calibration import read_calibration as read_calibration
-    from calibrate.files.calibration import write_calibration as write_calibration
-    from calibrate.files.exports import FrameNames as FrameNames
-    from calibrate.files.exports import export as export
-    from calibrate.files.install import install as install
-    from calibrate.files.install import rollback as rollback
-    from calibrate.files.install import set_validity as set_validity
-    from calibrate.files.loader import InstallationChange as InstallationChange
-    from calibrate.files.loader import InstalledCalibration as InstalledCalibration
-    from calibrate.files.loader import load_installed as load_installed
-    from calibrate.files.loader import watch as watch
-    from calibrate.files.validity import Validity as Validity
-    from calibrate.files.validity import ValidityReason as ValidityReason
-    from calibrate.files.validity import ValidityState as ValidityState
-    from calibrate.gates import GateLimits as GateLimits
-    from calibrate.geometry import Transform as Transform
-    from calibrate.job import JobOptions as JobOptions
-    from calibrate.job import SolvedRecording as SolvedRecording
-    from calibrate.job import solve_recording as solve_recording
-    from calibrate.pictures import SolvedPictures as SolvedPictures
-    from calibrate.pictures import read_folder as read_folder
-    from calibrate.pictures import solve as solve
-    from calibrate.results import Gate as Gate
-    from calibrate.solved import Solved as Solved
-
-__getattr__, __all__ = open_door(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -18,22 +18,6 @@ Everything else is private. Names are loaded at their first use.
 To read the code begin with `solve`.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from recordings.door import open_door
-
-if TYPE_CHECKING:
-    from calibrate.handeye.information import covariance_of as covariance_of
-    from calibrate.handeye.information import prior_information as prior_information
-    from calibrate.handeye.information import view_information as view_information
-    from calibrate.handeye.noise_scales import MeasurementNoise as MeasurementNoise
-    from calibrate.handeye.peers import compare_all as compare_all
-    from calibrate.handeye.priors import BoardTolerance as BoardTolerance
-    from calibrate.handeye.solution import Solution as Solution
-    from calibrate.handeye.solution import SolveOptions as SolveOptions
-    from calibrate.handeye.solve import solve_views as solve_views
-    from calibrate.results import PeerResult as PeerResult
-    from calibrate.views import BoardView as BoardView
-    from calibrate.views import ViewSet as ViewSet
-
-__getattr__, __all__ = open_door(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

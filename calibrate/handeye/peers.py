@@ -44,7 +44,8 @@ from calibrate.handeye.reprojection import corner_residuals
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_robust_profile
 from calibrate.projection import intrinsics_vector
-from calibrate.results import SHAPE, PeerResult
+from calibrate.results import SHAPE
+from calibrate.results import PeerResult as PeerResult
 from calibrate.views import ViewSet, observe_views
 
 Method = Callable[[ViewSet], Array]

@@ -77,7 +77,9 @@ from calibrate.handeye.solution import (
 )
 from calibrate.projection import intrinsics_names
 from calibrate.results import Arm, ArmErrorValue, BoardShape, Certificate, HoldoutScore, Remark
-from calibrate.views import ViewSet, array_of
+from calibrate.views import BoardView as BoardView
+from calibrate.views import ViewSet as ViewSet
+from calibrate.views import array_of
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 

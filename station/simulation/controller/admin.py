@@ -36,24 +36,38 @@ JointSpeed = Annotated[float, Meta(ge=1e-3, le=100)]
 Three = tuple[float, float, float]
 
 
+COMMANDS: dict[str, Command] = {}
+"""Name → function. Its parameters behind the machine are the keys that a client sends."""
+
+
+def command(function: Command) -> Command:
+    """Register a function as the command of its name."""
+    COMMANDS[function.__name__] = function
+    return function
+
+
+@command
 def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> None:
     """Cuts every connection of these ports (rtde, script, dashboard; all if none named) by fin or rst."""
     for service in machine.chosen(ports):
         service.cut(how)
 
 
+@command
 def mute(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
     """Ports accept connections, but what arrives is lost and nothing is answered."""
     for service in machine.chosen(ports):
         service.silent = on
 
 
+@command
 def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
     """A cable pulled out: links carry nothing, connecting hangs."""
     for service in machine.chosen(ports):
         service.black_hole(on)
 
 
+@command
 def spoil(machine: Machine, outputs: list[str]) -> None:
     """These outputs, such as "actual_q", are sent as NaN from now on; an empty list: none."""
     if whole := [name for name in outputs if machine.robot.outputs.types[name] not in ("DOUBLE", "VECTOR6D")]:
@@ -61,6 +75,7 @@ def spoil(machine: Machine, outputs: list[str]) -> None:
     machine.rtde.spoiled = tuple(outputs)
 
 
+@command
 def restart(
     machine: Machine, down_s: Annotated[float, Meta(ge=0, le=60)] = 1.0, running: bool = False
 ) -> None:
@@ -68,22 +83,26 @@ def restart(
     machine.reboot(down_s, running)
 
 
+@command
 def in_use(machine: Machine, inputs: list[str]) -> None:
     """Another RTDE client owns these input variables (e.g. "input_int_register_0")."""
     for name in inputs:
         machine.rtde.claim(name, ADMIN)
 
 
+@command
 def foreign(machine: Machine, name: str = "palletising.urp") -> None:
     """Somebody else's program starts."""
     machine.robot.start_program(InterpretedProgram(machine.robot, name, WAITS))
 
 
+@command
 def slider(machine: Machine, fraction: Share) -> None:
     """Speed slider on the pendant, 0…1."""
     machine.robot.slider = fraction
 
 
+@command
 def remote(machine: Machine, on: bool = True) -> None:
     """Remote (on) or local control (e-Series). Going local stops a remotely started program."""
     robot = machine.robot
@@ -92,17 +111,20 @@ def remote(machine: Machine, on: bool = True) -> None:
     robot.remote = on
 
 
+@command
 def tcp(machine: Machine, pose: Six) -> None:
     """TCP of the installation: x y z [m], rotation vector [rad], in the flange."""
     machine.robot.tcp = pose
 
 
+@command
 def payload(machine: Machine, kg: NotNegative, cog_m: Three = (0.0, 0.0, 0.0)) -> None:
     """Payload of the installation."""
     machine.robot.payload_kg = kg
     machine.robot.payload_cog = cog_m
 
 
+@command
 def hand_move(machine: Machine, joints: Six, speed_rad_s: JointSpeed = 0.5) -> None:
     """A person leads the arm to these joints (free-drive, or the pendant's arrows), the fastest joint at
     speed_rad_s."""
@@ -110,6 +132,7 @@ def hand_move(machine: Machine, joints: Six, speed_rad_s: JointSpeed = 0.5) -> N
         raise ValueError("the arm is not free: a program plays, a safety stop holds it, or it has no power")
 
 
+@command
 async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> Json:
     """Where the arm truly was at a time of the host's monotonic clock (now, if none is given; waits up to
     2 s for a time to come): joints_rad [6], base_from_flange [4][4], miss [6] = [δt m, δφ rad] of it."""
@@ -128,6 +151,7 @@ async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> Json:
     }
 
 
+@command
 def state(machine: Machine) -> Json:
     """The controller's state now."""
     robot = machine.robot
@@ -144,6 +168,7 @@ def state(machine: Machine) -> Json:
     }
 
 
+@command
 def log(machine: Machine, since_monotonic_ns: int = 0) -> Json:
     """entries: every dashboard and script command, upload and RTDE write since that time (the newest 20 000);
     counts: how often each came, of all time."""
@@ -151,27 +176,61 @@ def log(machine: Machine, since_monotonic_ns: int = 0) -> Json:
     return {"entries": journal.entries(since_monotonic_ns), "counts": journal.counts}
 
 
-_SHORT: dict[str, Command] = {
-    "pstop": lambda m: m.robot.protective_stop("admin"),
-    "estop": lambda m: m.robot.emergency_stop(),
-    "safeguard": lambda m: m.robot.safeguard(),
-    "power_off": lambda m: m.robot.power_off(),
-    # RTDE links stay open but no data comes; everything else works.
-    "stall": lambda m, on=True: setattr(m.rtde, "stalled", on),
-    # RTDE sends the same packet for ever: the timestamp stands still on a live link.
-    "freeze": lambda m, on=True: setattr(m.rtde, "frozen", on),
-    "stop_program": lambda m: m.robot.stop_program("pendant"),
-    "pause": lambda m: {"paused": m.robot.pause_program()},
-    "play": lambda m: {"playing": m.robot.play_program()},
-}
-"""Of a person at the pendant, and of the safety system."""
-COMMANDS: dict[str, Command] = _SHORT | {
-    name: function
-    for name, function in list(globals().items())
-    if inspect.isfunction(function) and function.__module__ == __name__
-}
-"""Name → function. Every function above is a command too; its parameters behind the machine are the keys
-that a client sends."""
+# A person at the pendant, and the safety system.
+
+
+@command
+def pstop(machine: Machine) -> None:
+    """The arm's own protective stop."""
+    machine.robot.protective_stop("admin")
+
+
+@command
+def estop(machine: Machine) -> None:
+    """The emergency stop on the pendant."""
+    machine.robot.emergency_stop()
+
+
+@command
+def safeguard(machine: Machine) -> None:
+    """A safeguard stop: somebody opened the fence."""
+    machine.robot.safeguard()
+
+
+@command
+def power_off(machine: Machine) -> None:
+    """The arm loses its power."""
+    machine.robot.power_off()
+
+
+@command
+def stop_program(machine: Machine) -> None:
+    """The stop button of the pendant."""
+    machine.robot.stop_program("pendant")
+
+
+@command
+def pause(machine: Machine) -> Json:
+    """The pause button of the pendant."""
+    return {"paused": machine.robot.pause_program()}
+
+
+@command
+def play(machine: Machine) -> Json:
+    """The play button of the pendant."""
+    return {"playing": machine.robot.play_program()}
+
+
+@command
+def stall(machine: Machine, on: bool = True) -> None:
+    """RTDE links stay open but no data comes; everything else works."""
+    machine.rtde.stalled = on
+
+
+@command
+def freeze(machine: Machine, on: bool = True) -> None:
+    """RTDE sends the same packet for ever: the timestamp stands still on a live link."""
+    machine.rtde.frozen = on
 
 
 @cache

@@ -1,0 +1,12 @@
+from .information import covariance_of as covariance_of
+from .information import prior_information as prior_information
+from .information import view_information as view_information
+from .noise_scales import MeasurementNoise as MeasurementNoise
+from .peers import PeerResult as PeerResult
+from .peers import compare_all as compare_all
+from .priors import BoardTolerance as BoardTolerance
+from .solution import Solution as Solution
+from .solution import SolveOptions as SolveOptions
+from .solve import BoardView as BoardView
+from .solve import ViewSet as ViewSet
+from .solve import solve_views as solve_views

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.trials import Miss, rms, rows_of, table, trials
-from calibrate.geometry import Array, difference, rotation_log
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.handeye.workspace import Workspace, sample_range
+from recordings.geometry import Array, difference, rotation_log
 from recordings.schema.messages import Mount
 from tests.calibrate.chains import ArmCell, arm_cell
 

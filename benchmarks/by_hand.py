@@ -22,7 +22,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from benchmarks.trials import Miss, rms, rows_of, table, trials
-from calibrate.geometry import Array, pose, rotation_exp, transform_points
 from calibrate.handeye.metrics import median_distance_m, point_error_m
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
@@ -30,6 +29,7 @@ from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import camera_matrix, distortion, project
 from calibrate.views import BoardView, ViewSet
+from recordings.geometry import Array, pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from recordings.schema.stillness import WINDOW_S, scatter
 from station.analysis.estimation import quick_covariance

@@ -13,12 +13,12 @@ from benchmarks.trials import in_processes, rows_of, table, trials
 from calibrate.check.drift import SHIFT_M, DriftCheck, check_drift
 from calibrate.check.production import NEWEST, EarlierPictures
 from calibrate.check.trend import entry_of, find_trend
-from calibrate.geometry import Array
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.views import ViewSet
+from recordings.geometry import Array
 from recordings.schema.messages import Mount
 from tests.calibrate.chains import arm_cell, later_views
 

@@ -26,10 +26,10 @@ from benchmarks.real_sets import DATASETS
 from benchmarks.trials import table
 from calibrate.boards.detect import Detection, detect
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, rotation_log
 from calibrate.handeye.solution import Reading
 from calibrate.job import solve_recording
 from recordings.errors import RecordingError
+from recordings.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, rotation_log
 from recordings.importers.dataset import DATASET_FILE, HEADER, read_dataset, read_poses
 from recordings.importers.folder import import_folder
 from recordings.schema.messages import BoardSpec

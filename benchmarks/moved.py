@@ -11,11 +11,11 @@ import numpy as np
 
 from benchmarks.trials import rows_of, table, trials
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, pose
 from calibrate.handeye.solution import Reading, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views import ViewSet
+from recordings.geometry import Array, pose
 from recordings.schema.messages import Mount
 from tests.calibrate.chains import CAMERA, arm_cell, in_sight, views_at
 

@@ -25,7 +25,6 @@ from benchmarks.random_cells import (
 )
 from benchmarks.scene import MID
 from benchmarks.trials import percentiles, rms, rms_spread, table, trials
-from calibrate.geometry import Array, difference, perturb
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.priors import LensPrior, Priors
@@ -34,6 +33,7 @@ from calibrate.kinematics import forward
 from calibrate.projection import project
 from calibrate.results import SHAPE
 from calibrate.views import Observations, extent_of
+from recordings.geometry import Array, difference, perturb
 from station.cell.errors import LimitError
 from station.cell.layout import layout_of
 from station.cell.limits import check_plan

@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, pose, rotation_exp
 from calibrate.kinematics import MODELS, inverse_many, link_frames
+from recordings.geometry import Array, inverse, pose, rotation_exp
 from recordings.schema.messages import CameraModel
 from station.cell.config import (
     PAPER_BOARD,

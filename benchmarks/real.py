@@ -14,8 +14,8 @@ from benchmarks import real_arms
 from benchmarks.real_methods import FAILURES, Answer, calibration_rs, opencv, ours, predicted_centre
 from benchmarks.real_sets import DATASETS, RealSet, real_sets
 from benchmarks.trials import table
-from calibrate.geometry import Array, difference
 from calibrate.views import ViewSet
+from recordings.geometry import Array, difference
 
 FOLDS = 5
 FOLD_SEEDS = 5

@@ -17,7 +17,6 @@ import numpy as np
 from benchmarks.real_sets import read_set
 from benchmarks.trials import in_processes, rms, table
 from calibrate.chain import learn_chain
-from calibrate.geometry import Array, inverse, pose_from_quaternion, rotation_angle
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
 from calibrate.handeye.metrics import mean_pose
@@ -27,6 +26,7 @@ from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views import Places, ViewSet
+from recordings.geometry import Array, inverse, pose_from_quaternion, rotation_angle
 from recordings.schema.messages import BoardSpec
 
 FOLDER = Path(os.environ.get("STATION_ARM_SETS", Path(__file__).parents[2] / "shared" / "arm_sets"))

@@ -11,7 +11,6 @@ import vision_calibration
 from vision_calibration import models as rs
 
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, inverse, pose_from_quaternion, quaternion_from_matrix
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, ROBOT_WORLD, opencv_hand_eye, opencv_robot_world
 from calibrate.handeye.reprojection import bent_points
 from calibrate.handeye.solution import Solution, SolveOptions
@@ -20,6 +19,7 @@ from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views import BoardView, ViewSet, observe_views
+from recordings.geometry import Array, inverse, pose_from_quaternion, quaternion_from_matrix
 from recordings.schema.messages import BoardSpec, CameraModel
 
 FAILURES = (CalibrationError, cv2.error, np.linalg.LinAlgError, ValueError, RuntimeError)

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from calibrate.geometry import Array, project_to_rotation
 from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.recorded_views import load_views
 from calibrate.views import ViewSet
+from recordings.geometry import Array, project_to_rotation
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec

@@ -10,7 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.geometry import (
+from calibrate.handeye.noise_scales import MeasurementNoise
+from calibrate.lens.intrinsics import calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp
+from calibrate.projection import project
+from calibrate.views import BoardView, ViewSet
+from recordings.geometry import (
     Array,
     inverse,
     matrix_from_quaternion,
@@ -20,11 +25,6 @@ from calibrate.geometry import (
     rotation_exp,
     transform_points,
 )
-from calibrate.handeye.noise_scales import MeasurementNoise
-from calibrate.lens.intrinsics import calibrate_intrinsics
-from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project
-from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
 
 

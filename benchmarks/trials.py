@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from calibrate.geometry import Array, difference
 from calibrate.handeye.solution import Solution
+from recordings.geometry import Array, difference
 
 _PROCESSES = 2
 Task = TypeVar("Task")

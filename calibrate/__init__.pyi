@@ -1,5 +1,6 @@
 from .errors import CalibrationError as CalibrationError
 from .files.calibration import Calibration as Calibration
+from .files.calibration import Transform as Transform
 from .files.calibration import read_calibration as read_calibration
 from .files.calibration import write_calibration as write_calibration
 from .files.exports import FrameNames as FrameNames
@@ -15,7 +16,6 @@ from .files.validity import Validity as Validity
 from .files.validity import ValidityReason as ValidityReason
 from .files.validity import ValidityState as ValidityState
 from .gates import GateLimits as GateLimits
-from .geometry import Transform as Transform
 from .job import JobOptions as JobOptions
 from .job import SolvedRecording as SolvedRecording
 from .job import solve_recording as solve_recording

@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 
 from calibrate.chain import Chain, chain_of
 from calibrate.errors import CalibrationFileError
-from calibrate.geometry import Array, Transform
 from calibrate.kinematics import DhTable
 from calibrate.results import LearnedArm
 from calibrate.views import array_of
+from recordings.geometry import Array, Transform
 from recordings.schema.messages import Matrix4
 
 Vector3 = tuple[float, float, float]

@@ -19,7 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.geometry import (
+from calibrate.kinematics import DhTable, link_frames
+from calibrate.results import LearnedArm
+from recordings.geometry import (
     Array,
     difference,
     inverse_left_jacobian,
@@ -29,8 +31,6 @@ from calibrate.geometry import (
     rotation_log,
     skew,
 )
-from calibrate.kinematics import DhTable, link_frames
-from calibrate.results import LearnedArm
 
 
 @dataclass(frozen=True, eq=False)

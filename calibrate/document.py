@@ -26,7 +26,6 @@ from calibrate.files.calibration import (
     ViewWeight,
 )
 from calibrate.files.validity import time_text
-from calibrate.geometry import Transform
 from calibrate.handeye.solution import Solution
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
@@ -34,6 +33,7 @@ from calibrate.projection import intrinsics_names
 from calibrate.recorded_views import LoadedViews
 from calibrate.results import Gate, Remark
 from calibrate.views import ViewSet
+from recordings.geometry import Transform
 from recordings.plain_text import plain_text
 from recordings.reader import Recording
 from recordings.schema.messages import BoardKind

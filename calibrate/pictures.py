@@ -17,7 +17,6 @@ from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points, check_board, has_markers, typed_board
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.gates import judge
-from calibrate.geometry import Array
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
@@ -28,6 +27,7 @@ from calibrate.solved import Solved
 from calibrate.views import BoardView, ViewSet, array_of, require_size
 from recordings.errors import ImportSourceError
 from recordings.files import usable_cores
+from recordings.geometry import Array
 from recordings.importers import conventions
 from recordings.importers.dataset import DATASET_FILE, read_dataset
 from recordings.importers.folder import read_image

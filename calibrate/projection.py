@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, transform_points
+from recordings.geometry import Array, transform_points
 from recordings.schema.messages import CameraModel
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

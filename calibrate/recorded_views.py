@@ -13,7 +13,6 @@ import numpy as np
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import Array, pose, rotation_from_rpy
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.kinematics import MODELS, URDF_LINKS, URDF_ORIGIN, RobotModel, table_of_axes
 from calibrate.results import RejectedView
@@ -21,6 +20,7 @@ from calibrate.views import NO_CORNERS, NOMINAL_CAMERA, BoardView, ViewSet, requ
 from recordings import strict_yaml
 from recordings.errors import BadImageError
 from recordings.files import usable_cores
+from recordings.geometry import Array, pose, rotation_from_rpy
 from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.schema.messages import (

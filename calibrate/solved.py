@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from calibrate.errors import BadViewsError, require_choice
-from calibrate.geometry import Array
 from calibrate.handeye.reprojection import bent_points
 from calibrate.handeye.solution import Solution
 from calibrate.projection import project_at
 from calibrate.results import SHAPE, Gate
 from calibrate.views import BoardView, ViewSet, board_in_camera, observe_views
+from recordings.geometry import Array
 from recordings.schema.messages import CameraModel
 
 if TYPE_CHECKING:

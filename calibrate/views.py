@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibrate.errors import BadViewsError, require_choice
-from calibrate.geometry import Array, inverse
 from calibrate.kinematics import RobotModel
+from recordings.geometry import Array, inverse
 from recordings.schema.messages import CameraModel, Mount
 
 NOMINAL_CAMERA = CameraModel(640, 480, ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0)))

@@ -18,6 +18,7 @@ import msgspec
 
 from recordings.errors import RecordingError, disk_error, exists_error, recover_line, wrong_size_error
 from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
+from recordings.geometry import base_from_flange
 from recordings.image_headers import ImageError, read_header
 from recordings.manifest import PARTS_LIMIT
 from recordings.mcap.ending import check_ending
@@ -97,7 +98,7 @@ class RecordingWriter:
         due = not 0 <= time_ns - self._shown_ns < SHOWN_PERIOD_NS  # a clock that was set back counts, too
         if due and all(map(math.isfinite, state.tcp_pose)):
             self._shown_ns = time_ns
-            T = viewing.base_from_flange(state.tcp_pose, self.info.robot.tcp_offset)
+            T = base_from_flange(state.tcp_pose, self.info.robot.tcp_offset)
             self._show(Topic.TRANSFORM, viewing.frame_transform("base", "flange", T, time_ns), time_ns)
             self._show(Topic.JOINTS, viewing.joint_states(state, time_ns), time_ns)
 

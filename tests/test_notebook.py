@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibrate.geometry import difference
 from recordings.exporters.export import export_recording
+from recordings.geometry import difference
 from recordings.reader import open_recording
 from tests.calibrate.sessions import Scene, write_session
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.geometry import pose_from_quaternion, pose_from_rotvec
+from recordings.geometry import pose_from_quaternion, pose_from_rotvec
 from station.devices.posts import read_declaration, read_post
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"

@@ -10,8 +10,8 @@ from benchmarks.real import charge, left_out_error_m, paired_bootstrap
 from benchmarks.real_methods import calibration_rs, opencv, ours
 from benchmarks.real_sets import RealSet
 from benchmarks.scene import make_cell
-from calibrate.geometry import difference
 from calibrate.handeye.noise_scales import MeasurementNoise
+from recordings.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
 
 

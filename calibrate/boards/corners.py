@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from recordings.images import Pixels
 
 Grey = NDArray[np.uint8]

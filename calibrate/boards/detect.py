@@ -13,7 +13,7 @@ from calibrate.boards.corners import Grey, to_grey
 from calibrate.boards.grids import find_chessboard, find_circles, other_size
 from calibrate.boards.markers import NOTHING, find_april_grid, find_charuco, find_tag
 from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from recordings.images import Pixels
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 

@@ -28,7 +28,7 @@ from calibrate.boards.corners import (
     through,
 )
 from calibrate.boards.model import board_points, looks_same_turns
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from recordings.schema.boards import FEWEST_ON_A_SIDE
 from recordings.schema.messages import BoardKind, BoardSpec
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibrate.boards.corners import Grey, equalise, local_spacing, refine, sample, through
 from calibrate.boards.model import board_points, dictionary_id, tag_dictionary
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from recordings.schema.messages import BoardKind, BoardSpec
 
 _FEW_MARKERS = 0.7

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, pose, rotation_exp
+from recordings.geometry import Array, pose, rotation_exp
 from recordings.schema.boards import board_problem
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 

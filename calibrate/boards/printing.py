@@ -22,7 +22,7 @@ from calibrate.boards.model import (
     dictionary_id,
     tag_dictionary,
 )
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 _MARGIN_MM = 7.0

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration
-from calibrate.geometry import Array, difference, inverse, skew
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.reprojection import bent_points
 from calibrate.lens.pnp import candidate_poses
 from calibrate.views import BoardView, ViewSet, observe_views
+from recordings.geometry import Array, difference, inverse, skew
 
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03
 """Distance within which the board counts as not moved since the calibration."""

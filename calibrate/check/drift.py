@@ -18,7 +18,6 @@ from scipy import special
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.files.calibration import Calibration
-from calibrate.geometry import Array
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.linear import Linear
@@ -30,6 +29,7 @@ from calibrate.handeye.uncertainty import inverse_of
 from calibrate.projection import intrinsics_names
 from calibrate.results import SHAPE, DriftFigures
 from calibrate.views import ViewSet, extent_of, require_no_copies
+from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec
 
 FEWEST_FOR_DRIFT_CHECK = 3

@@ -14,7 +14,6 @@ from scipy import special
 
 from calibrate.check.drift import DriftCheck, powers
 from calibrate.errors import TooFewViewsError
-from calibrate.geometry import Array
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.estimate import estimate
@@ -24,6 +23,7 @@ from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.views import ViewSet, require_no_copies
+from recordings.geometry import Array
 
 EARLIER, MOST_EARLIER = 60, 300
 """Fewest and most earlier pictures."""

@@ -38,13 +38,13 @@ from calibrate.errors import UsageError
 from calibrate.files.calibration import write_calibration, write_output
 from calibrate.files.formatting import summary
 from calibrate.files.install import install_line
-from calibrate.geometry import roll_pitch_yaw
 from calibrate.handeye.solution import camera_frames
 from calibrate.job import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 from calibrate.lens.intrinsics import LensModel
 from calibrate.report.page import report_page
 from calibrate.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits, bounded
 from calibrate.results import PeerResult
+from recordings.geometry import roll_pitch_yaw
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 GATE_FAILED = 4

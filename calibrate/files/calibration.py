@@ -26,7 +26,6 @@ from calibrate.files.integrity import (
     verified_plain,
 )
 from calibrate.files.touch import Touch, agrees
-from calibrate.geometry import Transform
 from calibrate.results import (
     Arm,
     BoardShape,
@@ -39,6 +38,7 @@ from calibrate.results import (
     Remark,
 )
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
+from recordings.geometry import Transform as Transform
 from recordings.plain_text import plain_data
 from recordings.schema.messages import (
     BoardSpec,

@@ -14,8 +14,8 @@ from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
-from calibrate.geometry import roll_pitch_yaw
 from calibrate.results import BoardShape
+from recordings.geometry import roll_pitch_yaw
 from recordings.schema.messages import BoardSpec, Source
 
 SOURCE_STAMPS: dict[Source, str] = {

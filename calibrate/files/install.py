@@ -39,10 +39,10 @@ from calibrate.files.versions import (
     version_numbers,
     who,
 )
-from calibrate.geometry import difference
 from calibrate.handeye.metrics import point_error_m
 from calibrate.results import Gate
 from recordings.files import MAIN_CAMERA
+from recordings.geometry import difference
 from recordings.schema.messages import Source
 
 Cell = Literal["real", "imported", "simulated"]

@@ -14,9 +14,9 @@ import numpy as np
 
 from calibrate.errors import CalibrationFileError
 from calibrate.files.folders import VERSION_NAME
-from calibrate.geometry import Array, is_rigid, skew
 from recordings import strict_yaml
 from recordings.files import read_beginning
+from recordings.geometry import is_rigid, matrix_from_quaternion
 
 FORMATS = ("handeye-calibration/1", "handeye-calibration/2")
 """The second adds `posterior`."""
@@ -125,7 +125,7 @@ def check_result(plain: dict[str, Any], where: str) -> None:
     elif matrix.shape != (4, 4) or not is_rigid(matrix) or abs(np.linalg.norm(quaternion) - 1) > 1e-6:
         wrong = "the result is not a rigid transform"
     elif (
-        np.abs(_rotation(quaternion) - matrix[:3, :3]).max() > 1e-9
+        np.abs(matrix_from_quaternion(quaternion) - matrix[:3, :3]).max() > 1e-9
         or np.abs(matrix[:3, 3] - translation).max() > 1e-12
     ):
         wrong = "matrix, translation and quaternion do not agree"
@@ -138,9 +138,3 @@ def check_result(plain: dict[str, Any], where: str) -> None:
             wrong = "the covariance is not symmetric and positive"
     if wrong:
         raise CalibrationFileError("contradiction", path=where, why=wrong)
-
-
-def _rotation(quaternion_xyzw: Array) -> Array:
-    """Convert a unit quaternion (4,): R = (w² - v·v) I + 2 v vᵀ + 2 w [v]× (Kuipers 1999, eq. 5.11)."""
-    v, w = quaternion_xyzw[:3], quaternion_xyzw[3]
-    return np.asarray((w * w - v @ v) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * skew(v))

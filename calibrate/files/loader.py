@@ -15,8 +15,8 @@ from calibrate.errors import CalibrationError, CalibrationFileError, InstallErro
 from calibrate.files.folders import calibrations_folder, current_version, validity_of
 from calibrate.files.integrity import check_result, read_bounded, require_content_of_name, verified_plain
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, require_usable, time_text
-from calibrate.geometry import Array, Transform
 from recordings.files import MAIN_CAMERA
+from recordings.geometry import Array, Transform
 
 if TYPE_CHECKING:
     from recordings.schema.messages import CameraModel, Mount, Source

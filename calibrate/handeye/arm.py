@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.chain import Chain, LearnedChain, chain_of, learn_chain, read_otherwise, wrong_row
-from calibrate.geometry import Array, difference
 from calibrate.kinematics import MODELS, RobotModel, inverse_many, with_near_axes
 from calibrate.views import ViewSet
+from recordings.geometry import Array, difference
 
 FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
 """Names of a bracket's compliance, radians: turn about `row` for gravity along `column` of the flange."""

@@ -14,7 +14,6 @@ from functools import partial
 import numpy as np
 from scipy import special
 
-from calibrate.geometry import Array
 from calibrate.handeye.arm import FLEX
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import Estimate, MixtureParts, estimate
@@ -23,6 +22,7 @@ from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import Priors
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.views import Observations
+from recordings.geometry import Array
 
 SIZES = 0.0075 * 2.0 ** np.arange(10)
 """1σ of the shifts (mm) and turns (mrad) of the arm's links, from what no view can tell from none."""

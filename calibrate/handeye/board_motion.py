@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, inverse, project_to_rotation, rotation_angle
 from calibrate.views import ViewSet
+from recordings.geometry import Array, inverse, project_to_rotation, rotation_angle
 
 _TURN_RAD = np.radians(2.0)
 """Median difference of rotations of two programs' poses of one board, at most."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
-from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import ArmPostures, arm_postures, flange_extent, flex_motion, smooth_motion
 from calibrate.handeye.arm_fit import estimate_with_arm_errors
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
@@ -20,6 +19,7 @@ from calibrate.handeye.pose_fit import BoardPoses, agreed_start, pose_distances
 from calibrate.handeye.priors import Priors
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views
+from recordings.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 
 STAGES = logging.getLogger("calibrate.stages")
 """Tells people who wait what is computed."""

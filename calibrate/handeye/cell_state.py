@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.geometry import Array, difference, inverse_left_jacobian, perturb, skew
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.results import SHAPE
 from calibrate.views import Observations, Places, implied_flange
+from recordings.geometry import Array, difference, inverse_left_jacobian, perturb, skew
 from recordings.schema.messages import CameraModel, Mount
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from calibrate.geometry import Array, difference
 from calibrate.handeye.arm import LINKS, flex_motion
 from calibrate.handeye.cell_state import Quadratic
 from calibrate.handeye.linear import Linear, LinearSolution
@@ -34,6 +33,7 @@ from calibrate.handeye.pose_fit import (
 )
 from calibrate.handeye.priors import ARM_ERROR_UNIT
 from calibrate.handeye.solution import Reading
+from recordings.geometry import Array, difference
 
 FALSE_CLAIM = 1e-3
 """Probability of a claim in a recording in which nothing changed."""

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, perturb
 from calibrate.handeye.priors import LensPrior
 from calibrate.handeye.reprojection import corner_distance, corner_residuals, linearise_corners
 from calibrate.projection import intrinsics_vector, with_intrinsics_vector
 from calibrate.views import Observations
+from recordings.geometry import Array, perturb
 from recordings.schema.messages import CameraModel
 
 _STEPS = 60

@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
-from calibrate.geometry import Array
 from calibrate.handeye.noise_scales import MODE_COUNT
 from calibrate.handeye.reprojection import CornerBlocks, Eliminated
+from recordings.geometry import Array
 
 STUDENT = 8.0
 """Degrees of freedom of Student's t of a corner: a wrong detection loses its weight."""

@@ -8,7 +8,6 @@ import numpy as np
 from scipy import special
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, difference, skew
 from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.estimate import FULL, estimate
@@ -19,6 +18,7 @@ from calibrate.handeye.uncertainty import inverse_of
 from calibrate.projection import intrinsics_vector
 from calibrate.results import CrossValidation, RejectedView
 from calibrate.views import Places, implied_flange
+from recordings.geometry import Array, difference, skew
 
 _LOOSER = 0.01
 """Factor on the information of a stated value to test what X is without it; 0 could leave X undetermined."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corner_modes import STUDENT
 from calibrate.handeye.linear import MAX_STEPS, Fit, Linear
@@ -21,6 +20,7 @@ from calibrate.handeye.noise_scales import WIDE, Scales
 from calibrate.handeye.priors import KnownBefore, Priors
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.views import Observations
+from recordings.geometry import Array
 
 REJECTED = 0.05
 """A view is rejected where at most this probability is left that the robot's noise in it is up to three times

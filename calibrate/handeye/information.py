@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibrate.blas_threads import one_blas_thread
-from calibrate.geometry import Array
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.metrics import point_error_m
@@ -23,6 +22,7 @@ from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.projection import camera_matrix
 from calibrate.results import SHAPE
 from calibrate.views import Observations, array_of, board_in_camera, extent_of, require_mount
+from recordings.geometry import Array
 from recordings.schema.messages import CameraModel, Mount
 
 _FOCAL_SHARE = 0.05

@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from calibrate.geometry import Array, perturb
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic, flange_derivatives, flange_residuals
 from calibrate.handeye.corner_modes import INFORMATION, CornerModes
 from calibrate.handeye.mixture import SHARE_COUNTS, class_chances, expected
@@ -20,6 +19,7 @@ from calibrate.handeye.noise_scales import WIDE, Scales, update_corners, update_
 from calibrate.handeye.reprojection import linearise_corners
 from calibrate.handeye.uncertainty import information_lost, inverse_of
 from calibrate.views import Observations
+from recordings.geometry import Array, perturb
 
 ROUNDS = 8
 """Rounds of expectation and maximisation at one linearisation; the next linearisation goes on with them."""

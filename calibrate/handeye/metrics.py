@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 
 from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
-from calibrate.geometry import Array, difference, is_rigid, pose, project_to_rotation, rotation_angle, skew
 from calibrate.handeye.axxb.pairs import Pairs, screw_invariants
 from calibrate.projection import camera_matrix, distortion
 from calibrate.results import HoldoutScore
 from calibrate.views import BoardView, ViewSet, require_no_copies
 from recordings.errors import Value
+from recordings.geometry import Array, difference, is_rigid, pose, project_to_rotation, rotation_angle, skew
 from recordings.schema.messages import CameraModel
 
 _MIN_SECOND_AXIS_RAD = np.radians(0.3)

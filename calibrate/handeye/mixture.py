@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.geometry import Array
+from recordings.geometry import Array
 
 GAIN = np.array([1.0, 3.0, 10.0])
 """Robot noise of the first three classes, as multiples of the ordinary one."""

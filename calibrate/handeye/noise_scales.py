@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibrate.geometry import Array
 from calibrate.handeye.mixture import GAIN, GARBAGE_M, GARBAGE_RAD, SHARE_COUNTS
+from recordings.geometry import Array
 
 WIDE = 3.0
 _USUAL_ROBOT = np.array([1e-4, np.radians(0.02)])

@@ -13,7 +13,6 @@ from scipy import optimize
 
 from calibrate.blas_threads import one_blas_thread
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, inverse, is_rigid, perturb, rotation_log
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import on_box, solve_paper
 from calibrate.handeye.axxb.peer_methods import (
@@ -47,6 +46,7 @@ from calibrate.projection import intrinsics_vector
 from calibrate.results import SHAPE
 from calibrate.results import PeerResult as PeerResult
 from calibrate.views import ViewSet, observe_views
+from recordings.geometry import Array, inverse, is_rigid, perturb, rotation_log
 
 Method = Callable[[ViewSet], Array]
 HeldOut = tuple[ViewSet, Pairs]

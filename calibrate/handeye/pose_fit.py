@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_log
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import Quadratic, flange_derivatives
 from calibrate.handeye.corner_modes import CornerModes
@@ -23,6 +22,7 @@ from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.reprojection import linearise_corners
 from calibrate.projection import intrinsics_vector
 from calibrate.views import Places, ViewSet, implied_flange, observe_views
+from recordings.geometry import Array, difference, inverse, perturb, pose, rotation_log
 from recordings.schema.messages import Mount
 
 _SUBSETS, _SUBSET_VIEWS = 120, 4

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calibrate.chain import Chain, LearnedChain, as_rows, joint_readings
-from calibrate.geometry import Array, difference
 from calibrate.handeye.arm import (
     flange_extent,
     flex_motion,
@@ -25,6 +24,7 @@ from calibrate.handeye.uncertainty import inverse_of
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.results import SHAPE, Posterior
 from calibrate.views import Observations, ViewSet, observe_views
+from recordings.geometry import Array, difference
 from recordings.schema.messages import CameraModel
 
 

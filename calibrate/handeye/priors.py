@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibrate.errors import require_positive
-from calibrate.geometry import Array, difference
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic
 from calibrate.projection import intrinsics_names, intrinsics_vector
+from recordings.geometry import Array, difference
 from recordings.schema.messages import BoardSpec, CameraModel
 
 ASPECT_SIGMA = 0.001

@@ -15,7 +15,12 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibrate.geometry import (
+from calibrate.handeye.changes import ChangeSearch, errors_by_posture, is_claimed
+from calibrate.handeye.corner_fit import fit_corners
+from calibrate.handeye.pose_fit import FREE, BoardPoses, PoseFit, PoseViews, fit_poses, pose_views
+from calibrate.handeye.solution import Explanation, Reading, Rival
+from calibrate.views import ViewSet, observe_views
+from recordings.geometry import (
     Array,
     inverse,
     matrix_from_quaternion,
@@ -23,11 +28,6 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_log,
 )
-from calibrate.handeye.changes import ChangeSearch, errors_by_posture, is_claimed
-from calibrate.handeye.corner_fit import fit_corners
-from calibrate.handeye.pose_fit import FREE, BoardPoses, PoseFit, PoseViews, fit_poses, pose_views
-from calibrate.handeye.solution import Explanation, Reading, Rival
-from calibrate.views import ViewSet, observe_views
 
 _CLEAR = 10.0
 """Log evidence, besides the logarithm of the number of views, by which another reading has to win."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, skew
 from calibrate.projection import intrinsics_names, project
 from calibrate.results import SHAPE
 from calibrate.views import Observations
+from recordings.geometry import Array, skew
 from recordings.schema.messages import CameraModel
 
 _CHUNK_POINTS = 40_000

@@ -14,7 +14,6 @@ import numpy as np
 
 from calibrate.arm_table import CorrectedArm
 from calibrate.errors import require_choice, require_positive
-from calibrate.geometry import Array, Transform
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
@@ -29,6 +28,7 @@ from calibrate.results import (
     Remark,
 )
 from calibrate.views import BoardView
+from recordings.geometry import Array, Transform
 from recordings.schema.messages import CameraModel, Mount
 
 

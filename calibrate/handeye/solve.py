@@ -26,7 +26,6 @@ from scipy import special
 
 from calibrate.blas_threads import one_blas_thread
 from calibrate.errors import BadViewsError, PosesDisagreeError
-from calibrate.geometry import Array, Transform, skew
 from calibrate.handeye.arm import FLEX
 from calibrate.handeye.arm_result import arm_results
 from calibrate.handeye.axxb.certificate import TOLERANCE, certify
@@ -80,6 +79,7 @@ from calibrate.results import Arm, ArmErrorValue, BoardShape, Certificate, Holdo
 from calibrate.views import BoardView as BoardView
 from calibrate.views import ViewSet as ViewSet
 from calibrate.views import array_of
+from recordings.geometry import Array, Transform, skew
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 

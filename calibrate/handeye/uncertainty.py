@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.geometry import Array
+from recordings.geometry import Array
 
 _ROUNDING = 1e-14
 """Eigenvalue, of a matrix scaled to ones, that rounding alone may leave of one that is zero."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, matrix_from_quaternion, pose, skew
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
+from recordings.geometry import Array, matrix_from_quaternion, pose, skew
 from recordings.schema.messages import Mount
 
 _SHELL = (0.35, 0.9)

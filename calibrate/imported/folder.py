@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.model import describe_board
-from calibrate.geometry import inverse, pose
 from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boards
 from calibrate.imported.mounting import joints_of, joints_rad, mounting
 from calibrate.imported.pair_readings import PairsRead, ask_unit, read_pairs, rescaled, scales
@@ -42,6 +41,7 @@ from recordings.errors import (
     StandingReading,
     several_readings,
 )
+from recordings.geometry import inverse, pose
 from recordings.image_headers import ImageError, read_header
 from recordings.importers.conventions import (
     OPTICAL_FROM_AXES,

@@ -17,11 +17,11 @@ from dataclasses import replace
 import numpy as np
 
 from calibrate.chain import learn_chain
-from calibrate.geometry import Array, inverse
 from calibrate.imported.directions import TOOL_POSE
 from calibrate.imported.scenery import mount_by_scene
 from calibrate.imported.table_readings import TableReading
 from recordings.errors import ImportSourceError
+from recordings.geometry import Array, inverse
 from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import Mount
 

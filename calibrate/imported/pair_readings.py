@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.geometry import Array, inverse
 from calibrate.imported.board import GUESSED_M
 from calibrate.imported.directions import Told, directions, unit_named
 from calibrate.imported.mounting import OTHER_MOUNT, inverted_by_distances, mount_named
 from calibrate.imported.table_readings import TableReading, fitted_again, is_as_told
 from calibrate.lens.pnp import Candidate
 from recordings.errors import SeveralReadingsError, StandingReading, several_readings
+from recordings.geometry import Array, inverse
 from recordings.importers.conventions import (
     OPTICAL_FROM_AXES,
     UNITS,

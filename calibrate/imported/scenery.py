@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.boards.corners import Grey
-from calibrate.geometry import Array
 from calibrate.views import BoardView
+from recordings.geometry import Array
 from recordings.schema.messages import CameraModel, Mount
 
 _VIEWS = 16

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.boards.model import has_markers
-from calibrate.geometry import Array, inverse, rotation_angle, rotation_log
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.board_motion import BoardMotion, board_extent_m, boards_own_motion
 from calibrate.handeye.pose_fit import (
@@ -32,6 +31,7 @@ from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates, with_poses
 from calibrate.views import ViewSet
 from recordings.errors import ImportSourceError, StandingReading, several_readings
+from recordings.geometry import Array, inverse, rotation_angle, rotation_log
 from recordings.importers.conventions import Convention, convention, possible, tells_direction
 from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import Mount

@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import Array
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.priors import LensPrior
 from calibrate.lens.pnp import planar_tilts
 from calibrate.projection import camera_matrix
 from calibrate.views import ViewSet, observe_views
+from recordings.geometry import Array
 from recordings.schema.messages import CameraModel
 
 LensModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]

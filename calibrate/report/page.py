@@ -24,12 +24,12 @@ from calibrate.files.formatting import (
     use_text,
     verdict_text,
 )
-from calibrate.geometry import Array, difference
 from calibrate.job import SolvedRecording
 from calibrate.projection import intrinsics_names, intrinsics_vector, project_at
 from calibrate.report import html
 from calibrate.views import board_in_camera
 from recordings import strict_yaml
+from recordings.geometry import Array, difference
 from recordings.images import viewable
 from recordings.schema.messages import View
 

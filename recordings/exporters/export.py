@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from recordings.errors import RecordingError, disk_error, exists_error
 from recordings.exporters import Target
 from recordings.files import sync_folder
+from recordings.geometry import quaternion_from_matrix
 from recordings.images import encode_png, mosaic_encoding, viewable
 from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE, Dataset
 from recordings.reader import Recording
 from recordings.schema.messages import ARM_KINEMATICS_NAME, UR_KINEMATICS_NAME, View
-from recordings.schema.viewing import quaternion_xyzw
 
 _EXTENSIONS = {"png": "png", "jpeg": "jpg"}
 
@@ -84,4 +85,4 @@ def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
     name = f"images/{view.index:03d}.{_EXTENSIONS[extension]}"
     (folder / name).write_bytes(data)
     T = view.base_from_flange
-    return [name, T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
+    return [name, T[0][3], T[1][3], T[2][3], *quaternion_from_matrix(np.array(T)[:3, :3]).tolist()]

@@ -13,13 +13,15 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from recordings.errors import RecordingError
+from recordings.geometry import base_from_flange, quaternion_from_matrix
 from recordings.images import mosaic_encoding, raw_encoding
 from recordings.importers.messages import ros_types
 from recordings.reader import Recording
-from recordings.schema.messages import CameraModel, Matrix4, View
-from recordings.schema.viewing import base_from_flange, joint_names, quaternion_xyzw
+from recordings.schema.messages import CameraModel, View
+from recordings.schema.viewing import joint_names
 from recordings.segment import RecordingSegment
 
 FLANGE_FRAME, OPTICAL_FRAME = "tool0", "camera_calibrated_optical_frame"
@@ -124,9 +126,10 @@ class _Messages:
         stamp = self.make("builtin_interfaces/msg/Time", seconds, nanoseconds)
         return self.make("std_msgs/msg/Header", stamp, frame)
 
-    def frames(self, parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
-        at = self.make("geometry_msgs/msg/Vector3", *(float(row[3]) for row in T[:3]))
-        turn = self.make("geometry_msgs/msg/Quaternion", *quaternion_xyzw(T))
+    def frames(self, parent: str, child: str, T: ArrayLike, time_ns: int) -> Any:
+        at = self.make("geometry_msgs/msg/Vector3", *np.array(T)[:3, 3].tolist())
+        rotation_xyzw = quaternion_from_matrix(np.array(T)[:3, :3])
+        turn = self.make("geometry_msgs/msg/Quaternion", *rotation_xyzw.tolist())
         placed = self.make("geometry_msgs/msg/Transform", at, turn)
         header = self.header(time_ns, parent)
         stamped = self.make("geometry_msgs/msg/TransformStamped", header, child, placed)

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError, wrong_size_error
+from recordings.geometry import pose_from_vector, vector_from_pose
 from recordings.image_headers import KEPT_FORMATS, ImageError, read_header
 from recordings.images import Pixels, decode_image, encode_png, pixel_format_of, raw_array
 from recordings.importers.bags import open_bag
@@ -33,7 +33,6 @@ from recordings.schema.messages import (
     Vector6,
     View,
 )
-from recordings.schema.viewing import matrix_of
 
 STOPS_LEAST = 3
 _STATES_A_FRAME = 1000
@@ -123,8 +122,8 @@ def _states(chosen: Selection, info: SessionInfo) -> Iterator[RobotState]:
     joints = chosen.joints
     if joints is None:
         return
-    T = chosen.track.at(joints.stamps_ns) @ matrix_of(info.robot.tcp_offset)
-    poses = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_rotvec()]).tolist()
+    T = chosen.track.at(joints.stamps_ns) @ pose_from_vector(info.robot.tcp_offset)
+    poses = vector_from_pose(T).tolist()
     speeds = [()] * len(poses) if joints.speeds_rad_s is None else joints.speeds_rad_s.tolist()
     for stamp_ns, at, moving, pose in zip(
         joints.stamps_ns.tolist(), joints.positions_rad.tolist(), speeds, poses, strict=True

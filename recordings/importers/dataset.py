@@ -18,6 +18,7 @@ import numpy as np
 from recordings import strict_yaml
 from recordings.errors import ImportSourceError, disk_error
 from recordings.files import read_file, session_name_from
+from recordings.geometry import pose_from_quaternion
 from recordings.image_headers import SIDE_LIMIT_PX
 from recordings.schema.boards import board_problem
 from recordings.schema.messages import (
@@ -171,11 +172,7 @@ class PoseLine:
 
 def pose_rows(lines: Sequence[PoseLine]) -> list[PoseRow]:
     """The rows' poses as matrices."""
-    from scipy.spatial.transform import Rotation  # a reader's process, which only reads, need not wait for it
-
-    T = np.broadcast_to(np.eye(4), (len(lines), 4, 4)).copy()
-    T[:, :3, :3] = Rotation.from_quat([line.rotation_xyzw for line in lines]).as_matrix()
-    T[:, :3, 3] = [line.position_m for line in lines]
+    T = pose_from_quaternion([line.position_m for line in lines], [line.rotation_xyzw for line in lines])
     return [
         PoseRow(line.line, line.image, tuple(map(tuple, matrix)), line.joints_rad)
         for line, matrix in zip(lines, T.tolist(), strict=True)

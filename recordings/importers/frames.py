@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError
+from recordings.geometry import matrix_from_quaternion
 from recordings.importers.messages import Array, FrameMessage
 
 SAMPLES_LIMIT = 4_000_000
@@ -152,7 +152,7 @@ class _Link:
             a, b = self.table[after - 1], self.table[after].copy()
             b[:, 3:] *= np.where((a[:, 3:] * b[:, 3:]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
             row = (1 - share) * a + share * b
-        position, R = row[:, :3], Rotation.from_quat(row[:, 3:]).as_matrix()
+        position, R = row[:, :3], matrix_from_quaternion(row[:, 3:])
         if self.forward:
             return position, R
         R = np.swapaxes(R, 1, 2)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from recordings.geometry import is_rigid
 from recordings.schema.messages import Matrix4, View
 
 VIEWS_LIMIT = 10_000
 """Views in one file at most."""
-_RIGID_TOLERANCE = 1e-6
 
 
 def has_rigid_poses(view: View) -> bool:
@@ -17,10 +17,5 @@ def has_rigid_poses(view: View) -> bool:
 
 
 def _is_rigid(told: Matrix4) -> bool:
-    T = np.array([n for row in told for n in row])
-    if T.size != 16 or not np.isfinite(T).all():
-        return False
-    T = T.reshape(4, 4)
-    R = T[:3, :3]
-    orthonormal = np.abs(R @ R.T - np.eye(3)).max() < _RIGID_TOLERANCE and np.linalg.det(R) > 0
-    return bool(orthonormal and np.abs(T[3] - [0, 0, 0, 1]).max() < _RIGID_TOLERANCE)
+    numbers = [n for row in told for n in row]
+    return len(numbers) == 16 and is_rigid(np.array(numbers).reshape(4, 4))

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -16,10 +15,11 @@ from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from recordings.geometry import quaternion_from_matrix
 from recordings.images import Pixels, raw_encoding
-from recordings.schema.messages import CameraModel, CaptureEvent, Matrix4, RobotState, Vector6
+from recordings.schema.messages import CameraModel, CaptureEvent, RobotState
 
 CAMERA_FRAME = "camera"
 JOINT_NAMES = [
@@ -85,27 +85,16 @@ def camera_calibration(model: CameraModel, time_ns: int) -> Any:
     return message
 
 
-def frame_transform(parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
-    """parent_from_child, so that a 3D panel knows where things are."""
-    x, y, z, w = quaternion_xyzw(T)
+def frame_transform(parent: str, child: str, T: ArrayLike, time_ns: int) -> Any:
+    """parent_from_child (4, 4), so that a 3D panel knows where things are."""
+    matrix = np.asarray(T, dtype=float)
     message = FrameTransform(parent_frame_id=parent, child_frame_id=child)
-    message.translation.x, message.translation.y, message.translation.z = T[0][3], T[1][3], T[2][3]
-    message.rotation.x, message.rotation.y, message.rotation.z, message.rotation.w = x, y, z, w
+    for name, place in zip("xyz", matrix[:3, 3].tolist(), strict=True):
+        setattr(message.translation, name, place)
+    for name, part in zip("xyzw", quaternion_from_matrix(matrix[:3, :3]).tolist(), strict=True):
+        setattr(message.rotation, name, part)
     _stamp(message, time_ns)
     return message
-
-
-def base_from_flange(tcp_pose: Vector6, tcp_offset: Vector6) -> Matrix4:
-    """The controller's tool pose without the tool: base_from_tcp and flange_from_tcp → base_from_flange."""
-    T = matrix_of(tcp_pose) @ np.linalg.inv(matrix_of(tcp_offset))
-    return tuple(map(tuple, T.tolist()))
-
-
-def matrix_of(pose: Vector6) -> NDArray[np.float64]:
-    """Position and rotation vector → 4×4."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(np.array(pose[3:]))[0], pose[:3]
-    return T
 
 
 def joint_states(state: RobotState, time_ns: int) -> Any:
@@ -162,12 +151,3 @@ def log_line(event: CaptureEvent, time_ns: int) -> Any:
     message = Log(level=_LEVELS[event.level], message=text, name=event.kind)
     _stamp(message, time_ns)
     return message
-
-
-def quaternion_xyzw(transform: Matrix4) -> tuple[float, float, float, float]:
-    """Quaternion of a rigid transform, w ≥ 0. I. Bar-Itzhack (2000). scipy takes long to load."""
-    R = np.array(transform)[:3, :3]
-    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    K = np.block([[R + R.T - np.trace(R) * np.eye(3), axis[:, None]], [axis, np.trace(R)]])
-    x, y, z, w = np.linalg.eigh(K)[1][:, -1].tolist()
-    return (x, y, z, w) if w >= 0 else (-x, -y, -z, -w)

@@ -14,7 +14,6 @@ import numpy as np
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array
 from calibrate.handeye.information import covariance_of, prior_information, view_information
 from calibrate.handeye.metrics import median_distance_m, point_error_m
 from calibrate.handeye.noise_scales import MeasurementNoise
@@ -24,6 +23,7 @@ from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views import BoardView, ViewSet
 from recordings.errors import RecordingError
+from recordings.geometry import Array
 from recordings.images import viewable
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Mount

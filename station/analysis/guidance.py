@@ -15,7 +15,6 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, pose, rotation_angle, rotation_exp, rotation_log, transform_points
 from calibrate.handeye.information import (
     USUAL_NOISE,
     predicted_error_m,
@@ -25,6 +24,7 @@ from calibrate.handeye.metrics import median_distance_m
 from calibrate.lens.pnp import candidate_poses, solve_pnp
 from calibrate.projection import project
 from calibrate.views import ViewSet, implied_flange
+from recordings.geometry import Array, pose, rotation_angle, rotation_exp, rotation_log, transform_points
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import as_views
 from station.analysis.found_cell import FoundCell, find_cell

@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount
 from station.analysis.estimation import FEWEST_FOR_LENS
 from station.analysis.guidance import NextView, Way, motion_px, next_view, way_to

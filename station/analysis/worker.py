@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, transform_points
 from calibrate.lens.pnp import planar_tilts
 from calibrate.views import BoardView
+from recordings.geometry import Array, transform_points
 from recordings.images import Pixels, eight_bits, viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image
 from station.analysis.pool import live_with_parent

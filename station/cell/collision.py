@@ -11,8 +11,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from calibrate.geometry import Array, transform_points
 from calibrate.kinematics import RobotModel, link_frames
+from recordings.geometry import Array, transform_points
 from recordings.schema.messages import Mount
 from station.cell.config import Capsule, LimitsConfig, vector3
 

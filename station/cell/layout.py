@@ -10,19 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import (
-    Array,
-    inverse,
-    pose_from_quaternion,
-    pose_from_rotvec,
-    quaternion_from_matrix,
-    rotation_log,
-    transform_points,
-)
 from calibrate.kinematics import MODELS, RobotModel, forward, with_near_axes
 from calibrate.projection import camera_matrix
 from calibrate.views import board_in_camera, implied_flange
-from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
+from recordings.geometry import (
+    Array,
+    inverse,
+    pose_from_quaternion,
+    quaternion_from_matrix,
+    transform_points,
+)
+from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.cell.collision import CellGeometry, plate
 from station.cell.config import (
     Capsule,
@@ -225,14 +223,3 @@ def require_kept_clear(config: StationConfig) -> None:
             raise ConfigError("no-guess", missing=name)
         if on_flange and guess.sigma_m > _MOST_DOUBT_M:
             raise LimitError("guess-too-rough", guess=name, sigma_m=guess.sigma_m, limit_m=_MOST_DOUBT_M)
-
-
-def pose_vector(matrix: Array) -> Vector6:
-    """Convert a pose (4, 4) to UR's form: x, y, z [m] and a rotation vector [rad]."""
-    return vector6([*matrix[:3, 3], *rotation_log(matrix[:3, :3])])
-
-
-def flange_pose(state: RobotState, tcp_offset: Vector6) -> Array:
-    """Compute base_from_flange (4, 4) from the controller's tool pose and its TCP offset."""
-    base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
-    return np.asarray(base_from_tcp @ inverse(pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])))

@@ -14,8 +14,8 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from calibrate.geometry import pose_from_rotvec
 from calibrate.kinematics import JOINT_NAMES
+from recordings.geometry import pose_from_rotvec
 from recordings.schema.messages import RobotState, Stillness
 from recordings.schema.stillness import LEAST_SAMPLES, scatter
 from station.cell.config import StillnessConfig

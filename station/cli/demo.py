@@ -17,8 +17,8 @@ from rich.text import Text
 
 from calibrate.files.calibration import Calibration, Sigma, read_calibration
 from calibrate.files.formatting import arm_sentences, use_text
-from calibrate.geometry import difference
 from recordings.files import state_root
+from recordings.geometry import difference
 from recordings.reader import open_recording
 from recordings.schema.messages import Matrix4, Mount
 from station.cell.errors import ConfigError, StationError

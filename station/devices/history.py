@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import msgspec
 
-from calibrate.geometry import interpolate, pose_from_rotvec
+from recordings.geometry import interpolate, pose_from_rotvec, vector_from_pose
 from recordings.schema.messages import RobotState, Stamps, Vector6
 from station.cell.clock_fit import ClockFit
+from station.cell.config import vector6
 from station.cell.errors import StaleStateError
-from station.cell.layout import pose_vector
 
 HISTORY_S = 10.0
 
@@ -51,4 +51,4 @@ def _mix_poses(first: Vector6, second: Vector6, fraction: float) -> Vector6:
     if first == second:
         return first
     a, b = (pose_from_rotvec(vector[:3], vector[3:]) for vector in (first, second))
-    return pose_vector(interpolate(a, b, fraction))
+    return vector6(vector_from_pose(interpolate(a, b, fraction)))

@@ -13,9 +13,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.geometry import pose_from_rotvec
 from recordings import strict_yaml
 from recordings.errors import RecordingError
+from recordings.geometry import pose_from_rotvec, vector_from_pose
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import (
     CameraIdentity,
@@ -32,7 +32,6 @@ from station.cell.clock_fit import ClockFit
 from station.cell.config import StationConfig, vector6
 from station.cell.config_file import guess_problems
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
-from station.cell.layout import pose_vector
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import ArmCondition, CameraCounts, FrameTiming
 from station.devices.cell import Cell
@@ -160,7 +159,7 @@ class PlaybackRobot:
             joints_rad=_joints(view),
             joint_speeds_rad_s=(0.0,) * 6,
             target_joints_rad=_joints(view),
-            tcp_pose=pose_vector(tool),
+            tcp_pose=vector6(vector_from_pose(tool)),
             robot_mode=7,
             safety_mode=1,
             safety_status_bits=1,

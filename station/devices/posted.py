@@ -22,8 +22,8 @@ from pathlib import Path
 
 import msgspec
 
-from calibrate.geometry import rotation_angle, rotation_exp
 from recordings.files import write_atomically
+from recordings.geometry import rotation_angle, rotation_exp
 from recordings.importers.conventions import Convention
 from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState, Source, Stamps, Vector6
 from recordings.schema.stillness import LEAST_SAMPLES

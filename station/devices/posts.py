@@ -12,13 +12,12 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from calibrate.geometry import is_rigid
 from recordings.errors import ImportSourceError
+from recordings.geometry import is_rigid, rotvec_from_quaternion, vector_from_pose
 from recordings.importers.conventions import Convention, convention
 from recordings.schema.messages import Joints, Vector6
 from station.cell.config import LARGEST_REACH_M, vector6
 from station.cell.errors import RobotError, StaleStateError
-from station.cell.layout import pose_vector
 
 UNIT_TOLERANCE = 1e-3
 """Of a quaternion's length, and of a matrix's rows: of numbers written with three digits or more."""
@@ -87,18 +86,15 @@ def _pose(numbers: Sequence[float | tuple[float, ...]], written: Convention | No
     matrix = np.array(rows)
     if not np.isfinite(matrix).all() or not is_rigid(matrix, UNIT_TOLERANCE):
         raise StaleStateError("post-rotation", problem="the matrix is no rotation and place, row by row")
-    return pose_vector(matrix)
+    return vector6(vector_from_pose(matrix))
 
 
 def _by_quaternion(numbers: Sequence[float]) -> Vector6:
-    """Written out, as it runs a thousand times a second: no matrix in between."""
     *place, x, y, z, w = numbers
     length = math.hypot(x, y, z, w)
     if not abs(length - 1) < UNIT_TOLERANCE or not all(map(math.isfinite, numbers)):
         raise StaleStateError("post-rotation", problem=f"the quaternion's length is {length:.3g}, not 1")
-    sine, sign = math.hypot(x, y, z), math.copysign(1.0, w)
-    scale = sign * 2 * math.atan2(sine, abs(w)) / sine if sine > 0 else 0.0
-    return vector6([*place, scale * x, scale * y, scale * z])
+    return vector6([*place, *rotvec_from_quaternion((x, y, z, w)).tolist()])
 
 
 def _converted(numbers: Sequence[float], written: Convention) -> Vector6:
@@ -112,4 +108,4 @@ def _converted(numbers: Sequence[float], written: Convention) -> Vector6:
         raise StaleStateError("post-unreadable", reason=reason) from None
     if not np.isfinite(matrix).all():
         raise StaleStateError("post-unreadable", reason="a number is not finite")
-    return pose_vector(matrix)
+    return vector6(vector_from_pose(matrix))

@@ -10,13 +10,13 @@ import numpy as np
 
 from calibrate.boards.corners import to_grey
 from calibrate.boards.grids import seen_size
+from recordings.geometry import base_from_flange
 from recordings.images import viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity
 from station.analysis.hand_guide import HandGuide
 from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.config import CameraChoice, StillnessConfig
 from station.cell.errors import StationError
-from station.cell.layout import flange_pose
 from station.cell.status import GuidanceStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import Camera
@@ -153,7 +153,7 @@ class CellSetup:
         self.guidance = await guide.look(cell, draft.views, image, seen)
         if not guide.take or self.draft is not draft or self._stillness.moved_ns >= begun_ns:
             return False
-        flange = np.array(flange_pose(arm.state(), arm.identity.tcp_offset))
+        flange = np.array(base_from_flange(arm.state().tcp_pose, arm.identity.tcp_offset))
         view = CapturedView(len(draft.views), flange, seen.indices, seen.pixels)
         self.change(views=(*draft.views, view))
         guide.taken(True)

@@ -16,9 +16,9 @@ import numpy as np
 import yaml
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, transform_points
 from calibrate.views import board_in_camera
 from recordings.files import ASKED_FOR, read_file, write_atomically
+from recordings.geometry import Array, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from recordings.strict_yaml import LIMIT_BYTES
 from station.analysis.found_cell import FoundCell

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from recordings.schema.messages import RobotState
 from station.cell.arm_acceptance import Figure, StopTestMove, StopWay
 from station.cell.stillness import RESTING_RAD_S

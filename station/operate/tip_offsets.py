@@ -19,11 +19,10 @@ from calibrate.files.folders import VERSION_NAME
 from calibrate.files.touch import Touch
 from calibrate.files.validity import time_text
 from calibrate.files.versions import note_in_file, note_installed, who
-from calibrate.geometry import Array, inverse, transform_points
 from calibrate.views import BoardView
+from recordings.geometry import Array, base_from_flange, inverse, transform_points
 from station.cell.config import Vector3
 from station.cell.errors import RefusedError
-from station.cell.layout import flange_pose
 from station.cell.status import StationStatus
 from station.operate.next_step import after_touches
 from station.protocol.client import Client
@@ -81,7 +80,7 @@ def read_touch(board: SeenBoard, corner: int, status: StationStatus | None) -> T
     if not robot.still:
         raise RefusedError("arm-moves")
     points = board_points(board.calibration.board)
-    flange = flange_pose(robot.state, robot.identity.tcp_offset)
+    flange = base_from_flange(robot.state.tcp_pose, robot.identity.tcp_offset)
     touching = transform_points(flange, np.array(board.tip_m))
     tip = transform_points(inverse(board.now.base_from_board), touching)
     offset_m = _offset_m(corner, points[corner], tip)

@@ -10,7 +10,6 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.chain import chain_of
-from calibrate.geometry import Array
 from calibrate.handeye.information import (
     USUAL_NOISE,
     covariance_of,
@@ -21,6 +20,7 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.projection import intrinsics_names
+from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.layout import CellLayout
 from station.cell.pose_plan import Criterion

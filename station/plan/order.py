@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from station.cell.collision import SPACING_M, CellGeometry, margins, moving_points, surface_speeds
 from station.cell.limits import leading_speed, leaving, trapezoid
 

@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array
 from calibrate.handeye.information import USUAL_NOISE, predicted_error_m
 from calibrate.handeye.metrics import median_distance_m
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.kinematics import forward
+from recordings.geometry import Array
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
 from station.cell.layout import CellLayout, layout_of, require_kept_clear

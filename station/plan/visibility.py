@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, pose, rotation_exp, transform_points
 from calibrate.kinematics import forward
 from calibrate.projection import camera_matrix, project
+from recordings.geometry import Array, pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.collision import ARM_BODIES, body_segments, segment_distance
 from station.cell.config import matrix4, vector6

@@ -11,13 +11,13 @@ from functools import partial
 
 import numpy as np
 
+from recordings.geometry import base_from_flange
 from recordings.images import Pixels, viewable
 from recordings.schema.messages import Image, RobotState, View
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
-from station.cell.layout import flange_pose
 from station.cell.status import StationState
 from station.devices.base import look_at
 from station.devices.news import RESTING_S
@@ -58,7 +58,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int, unchecked
         index=index,
         name=context.loaded().pose(index).name,
         picture_sequence=image.sequence,
-        base_from_flange=matrix4(flange_pose(state, context.cell.arm.identity.tcp_offset)),
+        base_from_flange=matrix4(base_from_flange(state.tcp_pose, context.cell.arm.identity.tcp_offset)),
         joints_rad=state.joints_rad or None,
         attempt=attempt,
         stamps=state.stamps,

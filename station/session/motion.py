@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from calibrate.geometry import difference
 from calibrate.kinematics import forward
 from recordings.errors import RecordingError
 from recordings.files import require_free_space
+from recordings.geometry import difference
 from recordings.schema.messages import RobotState, Vector6
 from station.cell.arm_acceptance import StopTestMove
 from station.cell.config import vector6

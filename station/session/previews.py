@@ -10,13 +10,13 @@ import numpy as np
 
 from calibrate.boards.detect import detect
 from calibrate.boards.model import check_board
+from recordings.geometry import base_from_flange
 from recordings.images import viewable
 from recordings.schema.messages import BoardSpec, Image
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, preview_image, sight
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
-from station.cell.layout import flange_pose
 from station.cell.status import NO_IMAGE, NOT_LOOKED, DetectionStatus, StationState
 from station.cell.stillness import NotStillError
 from station.protocol.states import RUNNING
@@ -113,7 +113,7 @@ class Previewer:
                 detect, viewable(image.pixels, image.pixel_format), tag, False, False, timeout_s=_OBSERVE_S
             )
         return Observation(
-            base_from_flange=matrix4(flange_pose(state, arm.identity.tcp_offset)),
+            base_from_flange=matrix4(base_from_flange(state.tcp_pose, arm.identity.tcp_offset)),
             corners=tuple(found.indices.tolist()),
             pixels=tuple((float(u), float(v)) for u, v in found.pixels),
         )

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from calibrate.geometry import Array
+from recordings.geometry import Array
 from recordings.schema.messages import CameraIdentity, Image
 from station.analysis.pool import WorkerError, Workers
 from station.cell.config import CameraConfig

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.geometry import Array, inverse
+from recordings.geometry import Array, inverse
 from recordings.schema.messages import CameraModel, Image, Stamps
 from station.analysis.pool import live_with_parent
 from station.cell.errors import RobotError

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, pose, project_to_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
+from recordings.geometry import Array, inverse, pose, project_to_rotation, rotation_exp
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
 from station.cell.config import (
     PAPER_BOARD,

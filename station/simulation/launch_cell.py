@@ -13,10 +13,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.geometry import Array, perturb
+from recordings.geometry import Array, base_from_flange, perturb
 from recordings.schema.messages import CameraModel
 from station.cell.config import PoseGuess, StationConfig, matrix4, vector6
-from station.cell.layout import flange_pose, guess_matrix, known_places, layout_of, require_kept_clear
+from station.cell.layout import guess_matrix, known_places, layout_of, require_kept_clear
 from station.devices.base import Camera
 from station.devices.cell import Cell
 from station.devices.ur import UrRobot
@@ -127,7 +127,7 @@ def _posted_cell(config: StationConfig, path: str, folder: Path, control: Path, 
     arm = PostedArm(config, "simulated", control)
 
     def flange() -> Array:
-        return flange_pose(arm.state(), arm.identity.tcp_offset)
+        return base_from_flange(arm.state().tcp_pose, arm.identity.tcp_offset)
 
     folder.mkdir(parents=True, exist_ok=True)
     attachments = {TRUTH: write_truth(truth, folder / TRUTH)}

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project
 from calibrate.views import BoardView, ViewSet
+from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from recordings.schema.messages import CameraModel, Mount
 
 _RIGHT = np.pi / 2

@@ -15,8 +15,8 @@ import threadpoolctl
 import calibrate
 from calibrate.blas_threads import one_blas_thread
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array
 from calibrate.handeye import SolveOptions, ViewSet, compare_all, solve_views
+from recordings.geometry import Array
 from tests.calibrate.cells import exact_motions, make_cell
 from tests.patience import PATIENCE_S
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibrate.chain import learn_chain, read_otherwise, wrong_row
-from calibrate.geometry import Array, difference, pose, rotation_exp
+from recordings.geometry import Array, difference, pose, rotation_exp
 from tests.calibrate.chains import ROWS, DhArm
 
 TILTED = pose(rotation_exp([0.0, np.radians(30), 0.0]), [0.1, 0.2, 0.3])

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from calibrate.geometry import perturb
 from calibrate.imported import believe
+from recordings.geometry import perturb
 from recordings.image_headers import read_header
 from recordings.images import encode_png
 from recordings.importers.dataset import Dataset, PoseRow

@@ -18,10 +18,10 @@ import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from calibrate.geometry import pose, rotation_exp
 from calibrate.imported import Given, believe, board
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
+from recordings.geometry import pose, rotation_exp
 from recordings.importers.tables import look
 from recordings.reader import open_recording
 from tests.calibrate.pose_files import euler, quaternions

@@ -14,7 +14,6 @@ import pytest
 import yaml
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import difference
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
@@ -27,6 +26,7 @@ from calibrate.job import (
     with_board_poses,
 )
 from calibrate.views import ViewSet
+from recordings.geometry import difference
 from recordings.importers.folder import import_folder
 from recordings.schema.messages import CameraModel
 from tests.calibrate.cells import error_mm_deg, inside

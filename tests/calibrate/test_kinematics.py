@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from calibrate.geometry import Array, rotation_log, skew
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, jacobian, singularity_measure
+from recordings.geometry import Array, rotation_log, skew
 
 UR10 = MODELS["UR10"]
 NAMES = sorted(MODELS)

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibrate.geometry import inverse, pose
 from calibrate.handeye.board_motion import boards_own_motion
 from calibrate.handeye.solve import solve_views
 from calibrate.imported import Believed, Given, believe, is_described
@@ -25,6 +24,7 @@ from calibrate.imported.directions import Told, directions, unit_named
 from calibrate.views import NO_CORNERS, BoardView, ViewSet
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
+from recordings.geometry import inverse, pose
 from recordings.importers.conventions import OPTICAL_FROM_AXES
 from recordings.importers.tables import look
 from recordings.reader import open_recording

@@ -114,7 +114,7 @@ def test_corners_and_gaps_are_taken(given: dict[str, Any], solved: SolvedRecordi
     blank = [*corners[:-1], None]
     ours = calibrate.solve(**given | {"images": blank, "camera": size})
     assert list(ours.without_board) == [len(images) - 1]
-    off = calibrate.geometry.difference(ours.X, solved.solution.matrix)
+    off = recordings.geometry.difference(ours.X, solved.solution.matrix)
     assert off @ np.linalg.solve(solved.solution.covariance, off) < 22.5
     with raises("shape", CalibrationError):
         calibrate.solve(**given | {"images": blank, "camera": None})

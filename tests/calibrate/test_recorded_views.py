@@ -13,13 +13,13 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import pose, rotation_exp
 from calibrate.job import solve_recording
 from calibrate.kinematics import forward
 from calibrate.recorded_views import arm_of_ros, load_views
 from calibrate.report import html
 from calibrate.report.page import report_page
 from recordings.errors import MissingSegmentError
+from recordings.geometry import pose, rotation_exp
 from recordings.images import encode_png
 from recordings.manifest import enter_part
 from recordings.reader import Recording, open_recording

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import pose
 from calibrate.imported.scenery import mount_by_scene
 from calibrate.projection import project_at
 from calibrate.views import BoardView
+from recordings.geometry import pose
 from recordings.schema.messages import CameraModel, Mount
 from tests.calibrate.sessions import PAPER_BOARD, looking
 

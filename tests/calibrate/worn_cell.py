@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.imperfect_cells import Imperfection, Known, imperfect_cell
 from benchmarks.scene import LOW
-from calibrate.geometry import Array
 from calibrate.views import ViewSet
+from recordings.geometry import Array
 
 
 @dataclass(frozen=True, eq=False)

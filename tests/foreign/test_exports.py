@@ -15,7 +15,7 @@ import yaml
 from calibrate.arm_table import FramePose
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports import export
-from calibrate.geometry import Array, Transform, pose, rotation_exp
+from recordings.geometry import Array, Transform, pose, rotation_exp
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.simulation.cells import make_cell
 from tests.calibrate.files.test_arm_urdf import X, arm_of, urdf_of, within

@@ -7,10 +7,10 @@ import numpy as np
 from calibrate.arm_table import FramePose
 from calibrate.boards.model import board_points
 from calibrate.files.calibration import FORMAT, Calibration, Lens, Provenance, Quality, Sigma, Views
-from calibrate.geometry import Array, Transform, inverse, perturb
 from calibrate.projection import project_at
 from calibrate.results import Certificate
 from calibrate.views import BoardView
+from recordings.geometry import Array, Transform, inverse, perturb
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig
 from station.simulation.truth import CellTruth

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
+from recordings.geometry import rotation_log
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import (
     ArmKinematics,

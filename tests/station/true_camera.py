@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, transform_points
 from calibrate.projection import project
 from calibrate.views import board_in_camera
+from recordings.geometry import Array, transform_points
 from station.simulation.truth import CellTruth
 
 

@@ -20,7 +20,7 @@ import pytest
 
 from calibrate.cli import main as calibrate
 from calibrate.files.versions import installed_versions
-from calibrate.geometry import Array, difference
+from recordings.geometry import Array, difference
 from station.cell.child import start_child
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan

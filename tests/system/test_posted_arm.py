@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from calibrate.files.install import installed_calibration
-from calibrate.geometry import interpolate, quaternion_from_matrix
+from recordings.geometry import interpolate, quaternion_from_matrix
 from station.cell.config import CameraConfig, CaptureConfig, RobotConfig
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import PlannedPose

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import pose as pose_of
+from recordings.geometry import pose as pose_of
 from station.cell.config import matrix4
 from station.cell.status import ArmCondition, EstimateStatus, PoseStatus, StationState
 from station.tui.capture_panels import coverage_lines, error_columns, error_lines, errors_after

@@ -12,7 +12,7 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input, OptionList, Static
 
-from calibrate.geometry import difference
+from recordings.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec, Image, Stamps
 from station.cell.config import CameraChoice
 from station.cell.config_file import load_config

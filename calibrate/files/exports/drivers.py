@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from calibrate.errors import UsageError
 from calibrate.files.exports.robot import LARGEST, Urdf, origin_of
 from calibrate.files.integrity import read_bounded
-from calibrate.geometry import quaternion_from_matrix
 from recordings import strict_yaml
+from recordings.geometry import quaternion_from_matrix
 from recordings.importers.frames import FrameTree
 from recordings.importers.messages import FrameMessage
 

@@ -13,9 +13,9 @@ from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.formatting import SOURCE_STAMPS
 from calibrate.files.validity import Validity, validity_text
-from calibrate.geometry import Array, inverse, pose
 from calibrate.kinematics import MODELS
 from recordings.files import MAIN_CAMERA
+from recordings.geometry import Array, inverse, pose
 from recordings.importers.frames import FrameTree
 
 BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])

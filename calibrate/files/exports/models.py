@@ -16,8 +16,8 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.exports.formats import export_format
 from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment
 from calibrate.files.integrity import content_sha256
-from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
 from calibrate.kinematics import URDF_LINKS, URDF_ORIGIN, DhTable, link_frames
+from recordings.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
 
 
 @export_format(".urdf", "attached")

@@ -22,7 +22,11 @@ from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports.frames import FrameNames, comment
 from calibrate.files.exports.models import camera, commented, numbers, table_of
-from calibrate.geometry import (
+from calibrate.handeye.axxb.global_start import solve_global
+from calibrate.handeye.axxb.pairs import all_pairs
+from calibrate.handeye.metrics import mean_pose
+from calibrate.handeye.workspace import sample_range
+from recordings.geometry import (
     Array,
     difference,
     inverse,
@@ -32,10 +36,6 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_from_rpy,
 )
-from calibrate.handeye.axxb.global_start import solve_global
-from calibrate.handeye.axxb.pairs import all_pairs
-from calibrate.handeye.metrics import mean_pose
-from calibrate.handeye.workspace import sample_range
 
 _MAX_OFF_M, _MAX_OFF_RAD = 5e-3, 2e-2
 """Rms differences of flanges up to which a URDF is this arm: a maker's calibration of an arm is less, another

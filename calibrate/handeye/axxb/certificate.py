@@ -21,9 +21,9 @@ import clarabel
 import numpy as np
 from scipy import sparse
 
-from calibrate.geometry import Array, project_to_rotation
 from calibrate.handeye.axxb.objective import QuadraticObjective
 from calibrate.results import Certificate
+from recordings.geometry import Array, project_to_rotation
 
 TOLERANCE = 1e-6
 FLOOR = 1e-8

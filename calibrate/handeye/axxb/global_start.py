@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, pose, project_to_rotation, rotation_exp
 from calibrate.handeye.axxb.certificate import certify
 from calibrate.handeye.axxb.objective import GENERATORS, QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import Pairs
 from calibrate.results import Certificate
+from recordings.geometry import Array, pose, project_to_rotation, rotation_exp
 
 _STEPS, _SETTLED_RAD = 40, 1e-10
 

@@ -13,8 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from calibrate.geometry import Array, project_to_rotation, skew
 from calibrate.handeye.axxb.pairs import Pairs
+from recordings.geometry import Array, project_to_rotation, skew
 
 Form = Literal["log", "chordal"]
 GENERATORS = skew(np.eye(3))

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.geometry import Array, inverse, rotation_log
+from recordings.geometry import Array, inverse, rotation_log
 from recordings.schema.messages import Mount
 
 Places = NDArray[np.intp]

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import Pairs
+from recordings.geometry import Array, pose, rotation_exp
 
 Evaluate = Callable[[Array], Array]
 """Candidates (m, d) → values (m,)."""

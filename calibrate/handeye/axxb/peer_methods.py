@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from scipy import optimize, sparse
 
-from calibrate.geometry import Array, inverse, perturb, pose, project_to_rotation, rotation_log
 from calibrate.handeye.axxb.certificate import certify
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import Pairs
+from recordings.geometry import Array, inverse, perturb, pose, project_to_rotation, rotation_log
 
 HAND_EYE = {
     "Tsai-Lenz": cv2.CALIB_HAND_EYE_TSAI,

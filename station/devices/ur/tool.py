@@ -23,12 +23,11 @@ from typing import Literal
 
 import numpy as np
 
-from calibrate.geometry import Array, difference, inverse, pose_from_rotvec
 from calibrate.kinematics import RobotModel, forward
+from recordings.geometry import Array, difference, inverse, pose_from_rotvec, vector_from_pose
 from recordings.schema.messages import ArmKinematics, RobotState, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError
-from station.cell.layout import pose_vector
 from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
 from station.devices.ur.stream import Payload, Sample
 
@@ -232,7 +231,7 @@ class TcpCheck:
         """flange_from_tcp: x y z [m], rotation vector [rad]; stated by the controller, else computed."""
         if self._stated is not None:
             return self._stated
-        return pose_vector(self._first)
+        return vector6(vector_from_pose(self._first))
 
     def agree(self, stated: Vector6) -> None:
         """Raise RobotError unless the offset that the control program reads is the one taken at connect."""

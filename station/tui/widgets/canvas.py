@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from textual.content import Content
 
-from calibrate.geometry import Array
+from recordings.geometry import Array
 
 BRAILLE = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 """Bits of a braille letter's dots, rows from the top."""

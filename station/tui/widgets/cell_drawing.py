@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from textual.content import Content
 
-from calibrate.geometry import Array, transform_points
+from recordings.geometry import Array, transform_points
 from station.cell.collision import body_segments
 from station.cell.config import StationConfig
 from station.cell.errors import StationError

@@ -19,7 +19,6 @@ from calibrate.check.trend import entry_of, find_trend
 from calibrate.cli.drift_check import check_text
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.files.calibration import read_calibration, write_calibration
-from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
 from calibrate.handeye.cell_state import CellState, Quadratic
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.posterior import KnownCell
@@ -29,6 +28,7 @@ from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import intrinsics_vector, project_at, with_intrinsics_vector
 from calibrate.views import BoardView, ViewSet, extent_of
+from recordings.geometry import Array, inverse, perturb, pose, rotation_exp
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from tests.calibrate.cells import MOUNTS, QUICK, changed
 from tests.calibrate.chains import arm_cell, later_views

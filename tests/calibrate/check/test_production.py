@@ -19,12 +19,12 @@ from calibrate.files.calibration import read_calibration
 from calibrate.files.install import install
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState
-from calibrate.geometry import inverse, perturb, pose, quaternion_from_matrix, rotation_exp
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.views import ViewSet
+from recordings.geometry import inverse, perturb, pose, quaternion_from_matrix, rotation_exp
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.simulation.renderer import render
 from tests.calibrate.chains import ArmCell, arm_cell, later_views

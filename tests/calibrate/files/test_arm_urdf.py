@@ -17,8 +17,8 @@ from calibrate.errors import BadViewsError, CalibrationFileError, UsageError
 from calibrate.files import exports
 from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration
 from calibrate.files.exports import FrameNames
-from calibrate.geometry import Array, Transform, inverse, pose, rotation_exp
 from calibrate.job import SolvedRecording
+from recordings.geometry import Array, Transform, inverse, pose, rotation_exp
 from tests.calibrate.chains import ROWS, DhArm
 from tests.calibrate.files.test_exports import calibration as calibration
 from tests.calibrate.files.test_exports import offered_arm, urdf_origin

@@ -15,7 +15,7 @@ from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports import FrameNames
 from calibrate.files.exports.drivers import fixed_frames
-from calibrate.geometry import Array, pose
+from recordings.geometry import Array, pose
 from recordings.importers.frames import FrameTree
 from recordings.schema.messages import RobotIdentity
 from tests.calibrate.files.test_exports import calibration as calibration

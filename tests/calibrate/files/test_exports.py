@@ -22,10 +22,10 @@ from calibrate.files import exports
 from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
-from calibrate.geometry import Array, FrameMismatchError, Transform, inverse, pose, rotation_exp
 from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, DhTable, RobotModel, forward, table_of_axes, with_near_axes
 from calibrate.recorded_views import arm_of_ros
+from recordings.geometry import Array, FrameMismatchError, Transform, inverse, pose, rotation_exp
 from recordings.schema.messages import RobotIdentity
 from tests.codes import raises
 

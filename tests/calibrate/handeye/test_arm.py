@@ -8,7 +8,6 @@ import pytest
 from scipy import stats
 
 from benchmarks.imperfect_cells import Imperfection, imperfect_cell
-from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye import cell_fit, estimate
 from calibrate.handeye.arm import arm_postures, flex_motion, gravity_in_flange
 from calibrate.handeye.cell_fit import fit_cell
@@ -16,6 +15,7 @@ from calibrate.handeye.estimate import Estimate, MixtureParts
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import solve_views
 from calibrate.views import ViewSet
+from recordings.geometry import Array, difference, inverse, pose, rotation_exp
 from recordings.schema.messages import Mount
 from tests.calibrate.cells import LOW, MOUNTS, QUICK, changed, error_mm_deg, inside, with_flange
 from tests.calibrate.chains import arm_cell

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from calibrate.gates import judge
-from calibrate.geometry import pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import solve_views
+from recordings.geometry import pose, rotation_exp, transform_points
 from tests.calibrate.cells import MID, MOUNTS, QUICK, changed, inside, make_cell, slipped
 
 SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])

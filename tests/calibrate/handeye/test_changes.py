@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks.moved import MOUNTS, measure, moved_cell
-from calibrate.geometry import perturb
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_changes, explain_recording, explain_text
 from calibrate.handeye.solution import Reading
+from recordings.geometry import perturb
 from tests.calibrate.cells import MID, make_cell, slipped, with_flange
 
 SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])

@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import difference
 from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.solve import solve_views
 from calibrate.projection import intrinsics_vector
+from recordings.geometry import difference
 from tests.calibrate.cells import (
     LENSES,
     LOW,

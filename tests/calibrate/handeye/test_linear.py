@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.geometry import perturb
 from calibrate.handeye.cell_state import CellState, Layout, flange_residuals
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.noise_scales import MeasurementNoise, Scales
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.reprojection import corner_residuals
 from calibrate.views import observe_views
+from recordings.geometry import perturb
 from tests.calibrate.cells import LENSES, MID, MOUNTS, changed, make_cell, real_cell
 
 ONE_CLASS = np.array([1.0, 1e-300, 1e-300, 1e-300])

@@ -5,11 +5,11 @@ import pytest
 
 from benchmarks.scene import random_rotation
 from calibrate.errors import DegenerateMotionError
-from calibrate.geometry import perturb, pose, rotation_exp
 from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.objective import pair_covariance
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
 from calibrate.handeye.metrics import axis_spread, board_spread, distance_in_sigmas, observe, require_motion
+from recordings.geometry import perturb, pose, rotation_exp
 from tests.calibrate.cells import LOW, exact_motions, make_cell
 
 

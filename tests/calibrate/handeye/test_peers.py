@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from benchmarks.scene import random_rotation
-from calibrate.geometry import inverse, is_rigid, pose, rotation_exp
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs
 from calibrate.handeye.axxb.peer_methods import linear_system, orthonormalised, zhao_minimax
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.peers import compare_all, reprojection_px
 from calibrate.handeye.solve import SolveOptions, solve_views
+from recordings.geometry import inverse, is_rigid, pose, rotation_exp
 from tests.calibrate.cells import LOW, MID, MOUNTS, error_mm_deg, make_cell
 
 NAMES = [

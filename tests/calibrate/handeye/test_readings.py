@@ -7,18 +7,18 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.errors import PosesDisagreeError
 from calibrate.gates import judge
-from calibrate.geometry import (
+from calibrate.handeye.pose_fit import pose_views
+from calibrate.handeye.readings import explain_recording
+from calibrate.handeye.solution import Reading
+from calibrate.handeye.solve import solve_views
+from calibrate.projection import project
+from recordings.geometry import (
     inverse,
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotation_exp,
     rotation_log,
 )
-from calibrate.handeye.pose_fit import pose_views
-from calibrate.handeye.readings import explain_recording
-from calibrate.handeye.solution import Reading
-from calibrate.handeye.solve import solve_views
-from calibrate.projection import project
 from tests.calibrate.cells import (
     HIGH,
     LOW,

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibrate.geometry import perturb
 from calibrate.handeye.reprojection import bent_points, corner_residuals, linearise_corners
 from calibrate.projection import intrinsics_vector, with_intrinsics_vector
 from calibrate.views import observe_views
+from recordings.geometry import perturb
 from tests.calibrate.cells import LENSES, changed, printed, real_cell
 
 SHAPE = (0.01, 0.02, 0.003, -0.002, 0.001)

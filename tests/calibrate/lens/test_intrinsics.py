@@ -9,10 +9,10 @@ import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.projection import project_at, undistort
 from calibrate.views import BoardView, ViewSet
+from recordings.geometry import Array, pose, rotation_exp
 from recordings.schema.messages import CameraModel
 from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, transform_points
+from recordings.geometry import Array, transform_points
 from recordings.schema.messages import CameraModel
 from station.analysis.worker import ExposureAdvice, assess
 from station.cell.config import PAPER_BOARD

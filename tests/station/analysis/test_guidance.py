@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.views import implied_flange
+from recordings.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from recordings.schema.messages import CameraModel, Mount
 from station.analysis.guidance import NextView, next_view, rim, way_to
 from station.analysis.worker import CapturedView

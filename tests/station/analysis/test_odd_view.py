@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
+from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from recordings.schema.messages import Mount
 from station.analysis.estimation import running_estimate
 from station.analysis.found_cell import FEWEST, find_cell, odd_view

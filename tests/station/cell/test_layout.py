@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import pose, rotation_exp, transform_points
+from recordings.geometry import pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
 from station.cell.collision import CellGeometry, body_segments, segment_distance
 from station.cell.config import Capsule, KinematicsDeltas, PoseGuess

@@ -9,10 +9,10 @@ import msgspec
 import pytest
 
 from calibrate.kinematics import MODELS, forward
+from recordings.geometry import vector_from_pose
 from recordings.schema.messages import RobotState, Stamps
-from station.cell.config import StillnessConfig
+from station.cell.config import StillnessConfig, vector6
 from station.cell.errors import StaleStateError
-from station.cell.layout import pose_vector
 from station.cell.stillness import NotStillError, StillnessMonitor
 from tests.codes import raises
 from tests.recordings.small_recording import PLAYING
@@ -27,7 +27,7 @@ def state(at_s: float, joint_rad: float = 0.0, speed_rad_s: float = 0.0) -> Robo
         PLAYING,
         stamps=Stamps(controller_s=at_s),
         joints_rad=joints,
-        tcp_pose=pose_vector(forward(MODELS["UR10"], joints)),
+        tcp_pose=vector6(vector_from_pose(forward(MODELS["UR10"], joints))),
         joint_speeds_rad_s=(0.0, speed_rad_s, 0.0, 0.0, 0.0, 0.0),
     )
 
@@ -75,7 +75,7 @@ def test_a_slow_creep_is_no_rest_although_no_speed_is_reported(joint: int, moves
     m = monitor()
     for i in range(60):
         joints = (*HOME[:joint], HOME[joint] + 0.001 * i * 0.008, *HOME[joint + 1 :])
-        pose = pose_vector(forward(MODELS["UR10"], joints))
+        pose = vector6(vector_from_pose(forward(MODELS["UR10"], joints)))
         m.add(msgspec.structs.replace(state(i * 0.008), joints_rad=joints, tcp_pose=pose))
     found = m.measure()
     assert found is not None and m.unrest(found).startswith(moves)

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import difference, pose_from_rotvec
 from calibrate.kinematics import MODELS, forward
+from recordings.geometry import difference, pose_from_rotvec
 from recordings.images import encode_png
 from recordings.schema.messages import (
     CameraIdentity,

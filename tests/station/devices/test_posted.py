@@ -17,11 +17,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import pose_from_quaternion
+from recordings.geometry import base_from_flange, pose_from_quaternion
 from recordings.schema.messages import RobotState
 from station.cell.config import RobotConfig, StillnessConfig
 from station.cell.errors import RobotError
-from station.cell.layout import flange_pose
 from station.cell.stillness import StillnessMonitor
 from station.devices import posted
 from station.devices.posted import PAUSE_S, PostedArm
@@ -124,7 +123,7 @@ async def test_a_posted_arm_is_there_with_its_first_pose_and_its_states_carry_po
     await until(lambda: len(states) == 3)
     assert (await arm.connect()).model == "arm of three words"
     for state in states:
-        assert np.abs(flange_pose(state, arm.identity.tcp_offset) - exact).max() < 1e-14
+        assert np.abs(base_from_flange(state.tcp_pose, arm.identity.tcp_offset) - exact).max() < 1e-14
     assert [len(state.joints_rad) for state in states] == [7, 0, 0]
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
 from calibrate.views import implied_flange
+from recordings.geometry import Array, pose, rotation_exp, transform_points
 from recordings.schema.messages import RobotIdentity
 from station.analysis.worker import CapturedView
 from station.cell.config import CameraChoice

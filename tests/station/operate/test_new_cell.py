@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points, typed_board
-from calibrate.geometry import difference, pose
+from recordings.geometry import difference, pose
 from recordings.schema.messages import BoardKind, Image, Mount, RobotIdentity, Stamps
 from station.analysis.found_cell import FoundCell
 from station.cell.config import CameraChoice

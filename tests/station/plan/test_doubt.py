@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import perturb
 from calibrate.kinematics import forward
+from recordings.geometry import perturb
 from station.cell.collision import margins
 from station.cell.layout import cell_geometry, guess_from, layout_of
 from station.plan.visibility import outline, uncertain_pixels

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import (
+from calibrate.handeye.information import predicted_error_m
+from calibrate.kinematics import MODELS, forward, inverse_many
+from recordings.geometry import (
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotation_angle,
     rotation_exp,
 )
-from calibrate.handeye.information import predicted_error_m
-from calibrate.kinematics import MODELS, forward, inverse_many
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.layout import cell_geometry, layout_of
 from station.cell.limits import check_plan

@@ -11,11 +11,11 @@ import pytest
 
 from calibrate.boards.model import board_points
 from recordings.errors import CodedError
+from recordings.geometry import base_from_flange
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection
 from station.cell.errors import CameraError
-from station.cell.layout import flange_pose
 from station.cell.status import NO_IMAGE, NOT_LOOKED, DetectionStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
@@ -41,7 +41,7 @@ async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_sess
     found = await rig.session.previews.observe(TAG)
     state = rig.arm.state()
     assert found.corners == (0, 1, 2, 3)
-    assert np.allclose(found.base_from_flange, flange_pose(state, rig.arm.identity.tcp_offset))
+    assert np.allclose(found.base_from_flange, base_from_flange(state.tcp_pose, rig.arm.identity.tcp_offset))
     assert len(told) == 1 and rig.camera.taken == 1
     assert rig.arm.log == [] and rig.state is S.IDLE
     assert not list(rig.session.context.root.rglob("*.mcap*"))

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, forward
+from recordings.geometry import pose_from_rotvec, rotation_log
 from recordings.schema.messages import Image, RobotIdentity, RobotState, Stamps, Vector6
 from station.cell.errors import RobotError
 from station.cell.status import StationState as S

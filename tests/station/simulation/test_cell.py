@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import is_rigid, transform_points
 from calibrate.kinematics import MODELS, forward
+from recordings.geometry import is_rigid, transform_points
 from station.cell.config import PAPER_BOARD
 from station.simulation.cells import board_centre, cell_config, make_cell
 from station.simulation.truth import read_truth, write_truth

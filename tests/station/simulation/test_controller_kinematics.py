@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate import kinematics as station
-from calibrate.geometry import pose_from_rotvec
+from recordings.geometry import pose_from_rotvec
 from station.simulation.controller.kinematics import TABLES, Rigid, forward, from_pose, to_pose
 
 numbers = st.floats(-1.5, 1.5)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.geometry import perturb
 from calibrate.kinematics import MODELS
 from calibrate.kinematics import forward as station_forward
+from recordings.geometry import perturb
 
 Q = (0.3, -1.2, 1.6, -1.0, -1.3, 0.4)
 

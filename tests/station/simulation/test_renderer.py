@@ -8,7 +8,7 @@ import pytest
 
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points, looks_same_turns
-from calibrate.geometry import Array, rotation_exp
+from recordings.geometry import Array, rotation_exp
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.cell.config import PAPER_BOARD
 from station.simulation.cells import seen_from

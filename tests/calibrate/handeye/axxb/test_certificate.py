@@ -4,11 +4,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.scene import random_rotation
-from calibrate.geometry import perturb, pose, rotation_exp
 from calibrate.handeye.axxb.certificate import TOLERANCE, _constraints, certify
 from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import all_pairs
+from recordings.geometry import perturb, pose, rotation_exp
 from tests.calibrate.cells import noisy_pairs
 
 

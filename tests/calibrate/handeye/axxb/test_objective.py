@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scene import random_rotation
-from calibrate.geometry import perturb, pose
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
+from recordings.geometry import perturb, pose
 from tests.calibrate.cells import exact_motions, noisy_pairs
 
 

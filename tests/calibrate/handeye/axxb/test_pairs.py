@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from benchmarks.scene import random_rotation
-from calibrate.geometry import inverse, pose
 from calibrate.handeye.axxb.pairs import (
     MAX_PAIRS,
     all_pairs,
@@ -10,6 +9,7 @@ from calibrate.handeye.axxb.pairs import (
     mount_poses,
     screw_invariants,
 )
+from recordings.geometry import inverse, pose
 from tests.calibrate.cells import MOUNTS, exact_motions, make_cell
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibrate.geometry import pose, rotation_exp
 from calibrate.handeye.axxb.pairs import consecutive_pairs
 from calibrate.handeye.axxb.paper import BOX, SETTINGS, EvolutionSettings, _partners, evolve, solve_paper
+from recordings.geometry import pose, rotation_exp
 from tests.calibrate.cells import LOW, make_cell
 
 ROOT = Path(__file__).parents[4]

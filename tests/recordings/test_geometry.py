@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scene import random_rotation
-from calibrate import geometry as g
+from recordings import geometry as g
 
 vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
 deltas = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(np.array)

@@ -129,10 +129,16 @@ def rotation_log(R: ArrayLike) -> Array:
     At exactly π the axis sign is ambiguous; either one is returned. What is not quite orthogonal is projected
     first; ValueError for what mirrors. (Written out: SciPy's takes two to three times as long.)
     """
-    return _rotation_vector(quaternion_from_matrix(R))
+    return rotvec_from_quaternion(quaternion_from_matrix(R))
 
 
-def _rotation_vector(q: Array) -> Array:
+def rotvec_from_quaternion(quaternion_xyzw: ArrayLike) -> Array:
+    """Convert quaternions (..., 4) x, y, z, w of any positive norm to rotation vectors (..., 3), radians.
+
+    The angle is in [0, π]: q and -q are the same rotation.
+    """
+    q = np.asarray(quaternion_xyzw, dtype=float)
+    q = q * np.copysign(1.0, q[..., 3:])
     sine = np.sqrt((q[..., :3] ** 2).sum(axis=-1, keepdims=True))
     return np.asarray(q[..., :3] * (2 * np.arctan2(sine, q[..., 3:]) / np.maximum(sine, 1e-300)))
 
@@ -204,7 +210,7 @@ def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Array:
     length = np.linalg.norm(q, axis=-1)
     if not (np.isfinite(length) & (length > 0)).all():
         raise ValueError("a quaternion of zeros, or one that is not finite, is no rotation")
-    return rotation_exp(_rotation_vector(q))
+    return rotation_exp(rotvec_from_quaternion(q))
 
 
 def pose_from_quaternion(translation_m: ArrayLike, quaternion_xyzw: ArrayLike) -> Array:
@@ -214,6 +220,25 @@ def pose_from_quaternion(translation_m: ArrayLike, quaternion_xyzw: ArrayLike) -
 def pose_from_rotvec(translation_m: ArrayLike, rotvec_rad: ArrayLike) -> Array:
     """Convert UR's convention, x, y, z [m] and a rotation vector [rad], to (..., 4, 4)."""
     return pose(rotation_exp(rotvec_rad), translation_m)
+
+
+def pose_from_vector(vector: ArrayLike) -> Array:
+    """Convert UR's six numbers (..., 6), x, y, z [m] and a rotation vector [rad], to (..., 4, 4)."""
+    v = np.asarray(vector, dtype=float)
+    return pose_from_rotvec(v[..., :3], v[..., 3:])
+
+
+def vector_from_pose(matrix: Array) -> Array:
+    """Convert poses (..., 4, 4) to UR's six numbers (..., 6): x, y, z [m] and a rotation vector [rad]."""
+    return np.concatenate([matrix[..., :3, 3], rotation_log(matrix[..., :3, :3])], axis=-1)
+
+
+def base_from_flange(tcp_pose: ArrayLike, tcp_offset: ArrayLike) -> Array:
+    """Take the tool off a controller's tool poses: base_from_flange (..., 4, 4).
+
+    tcp_pose: base_from_tcp (..., 6), tcp_offset: flange_from_tcp (6,), each as UR's six numbers.
+    """
+    return np.asarray(pose_from_vector(tcp_pose) @ inverse(pose_from_vector(tcp_offset)))
 
 
 def perturb(matrix: Array, delta: ArrayLike) -> Array:

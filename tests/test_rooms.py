@@ -99,7 +99,7 @@ READ_DIRECTLY = {
     "recordings/files.py",  # the one function
     "recordings/errors.py",  # a table of the package
     "recordings/importers/trees.py",  # an array of bytes that are read already
-    "recordings/cli/lazy.py", "recordings/door.py", "calibrate/document.py",  # our own source
+    "calibrate/document.py",  # our own source
     "station/protocol/stop_client.py",  # the page, by a program that loads little
     # the kernel's files
     "station/cell/process.py", "station/server/approval.py", "station/server/control_group.py",

@@ -11,12 +11,12 @@ from mcap.writer import CompressionType
 from scipy.spatial.transform import Rotation
 
 from recordings.cli import main
+from recordings.geometry import base_from_flange
 from recordings.images import viewable
 from recordings.importers.bag import import_bag
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import JOINT_SPEED_RAD_S, LEAST_SAMPLES, StandstillLimits
 from recordings.reader import open_recording
-from recordings.schema.viewing import base_from_flange
 from station.cell.config import StillnessConfig
 from station.cell.stillness import LEAST_SAMPLES as STATION_LEAST_SAMPLES
 from tests.command_line import call

@@ -13,6 +13,7 @@ import pytest
 
 from recordings.cli import main
 from recordings.exporters.export import export_recording
+from recordings.geometry import base_from_flange
 from recordings.images import encode_png
 from recordings.importers.bags import open_bag
 from recordings.importers.folder import import_folder
@@ -20,7 +21,6 @@ from recordings.importers.messages import Kind
 from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording
 from recordings.schema.messages import RobotIdentity, Stamps
-from recordings.schema.viewing import base_from_flange
 from recordings.writer import RecordingWriter
 from tests.command_line import call
 from tests.recordings.small_recording import (

@@ -21,16 +21,6 @@ To read the code begin with `robot`.
     tool             tool centre point and payload, and whether they were changed
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from recordings.door import open_door
-
-if TYPE_CHECKING:
-    from station.devices.ur.guided_arm import GuidedArm as GuidedArm
-    from station.devices.ur.robot import UrRobot as UrRobot
-    from station.devices.ur.robot import control_path as control_path
-    from station.devices.ur.robot import control_trouble as control_trouble
-    from station.devices.ur.robot import library_installed as library_installed
-    from station.devices.ur.stream import TraceRecorder as TraceRecorder
-
-__getattr__, __all__ = open_door(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

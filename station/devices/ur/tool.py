@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 
 from calibrate.kinematics import RobotModel, forward
-from recordings.geometry import Array, difference, inverse, pose_from_rotvec, vector_from_pose
+from recordings.geometry import Array, difference, inverse, pose_from_vector, vector_from_pose
 from recordings.schema.messages import ArmKinematics, RobotState, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError
@@ -191,10 +191,9 @@ class TcpCheck:
         if length_m > LONGEST_M:
             raise RobotError("tcp-too-far", model=model.name, distance_m=length_m, limit_m=LONGEST_M)
         if self._stated is not None:
-            _compare(
-                self._first, _pose(self._stated), _widened(self._tolerance, first), "tcp-mismatch", model.name
-            )
-            self._first = _pose(self._stated)
+            stated = pose_from_vector(self._stated)
+            _compare(self._first, stated, _widened(self._tolerance, first), "tcp-mismatch", model.name)
+            self._first = stated
 
     def _try_controllers_model(self, model: RobotModel, first: RobotState) -> None:
         """Use the controller's own kinematics if they explain its tool pose.
@@ -206,7 +205,7 @@ class TcpCheck:
         ours, theirs = (forward(m, first.joints_rad) for m in (self._model, model))
         _compare(theirs, ours, FACTORY_LIMIT, "other-kinematics", self._model.name)
         own = _flange_from_tcp(model, first)
-        if _exceeds(difference(own, _pose(self._stated)), _widened(CALIBRATED_TOLERANCE, first)):
+        if _exceeds(difference(own, pose_from_vector(self._stated)), _widened(CALIBRATED_TOLERANCE, first)):
             log.warning("the kinematics stated by the controller do not explain its tool pose; using ours")
             return
         self._model, self._tolerance = model, CALIBRATED_TOLERANCE
@@ -235,7 +234,7 @@ class TcpCheck:
 
     def agree(self, stated: Vector6) -> None:
         """Raise RobotError unless the offset that the control program reads is the one taken at connect."""
-        _compare(self._first, _pose(stated), self._tolerance, "tcp-mismatch", self._model.name)
+        _compare(self._first, pose_from_vector(stated), self._tolerance, "tcp-mismatch", self._model.name)
 
     def check(self, state: RobotState, installation: Installation) -> None:
         """Raise RobotError when the TCP on the pendant differs from that at connect, or from the one derived
@@ -247,7 +246,9 @@ class TcpCheck:
             tolerance, code = STATED_TOLERANCE, "tcp-changed"
             if self._stated is None:  # first stated after connecting: poses were computed with another one
                 tolerance, code = LATE_TOLERANCE, "tcp-late"
-            _compare(_pose(offset), _pose(self.offset), tolerance, code, self._model.name)
+            _compare(
+                pose_from_vector(offset), pose_from_vector(self.offset), tolerance, code, self._model.name
+            )
         now = _flange_from_tcp(self._model, state)
         _compare(now, self._first, _widened(self._tolerance, state), "tcp-changed", self._model.name)
 
@@ -355,7 +356,7 @@ def check_payload(now: Payload, first: Payload) -> None:
 
 
 def _flange_from_tcp(model: RobotModel, state: RobotState) -> Array:
-    return inverse(forward(model, state.joints_rad)) @ _pose(state.tcp_pose)
+    return inverse(forward(model, state.joints_rad)) @ pose_from_vector(state.tcp_pose)
 
 
 def _widened(tolerance: tuple[float, float], state: RobotState) -> tuple[float, float]:
@@ -363,10 +364,6 @@ def _widened(tolerance: tuple[float, float], state: RobotState) -> tuple[float, 
     turned_rad = SKEW_S * sum(map(abs, state.joint_speeds_rad_s))
     reach_m = float(np.linalg.norm(state.tcp_pose[:3])) + LONGEST_M
     return tolerance[0] + turned_rad * reach_m, tolerance[1] + turned_rad
-
-
-def _pose(vector: Vector6) -> Array:
-    return pose_from_rotvec(vector[:3], vector[3:])
 
 
 def _exceeds(delta: Array, tolerance: tuple[float, float]) -> bool:

@@ -2,10 +2,10 @@
 
 A change competes with what else makes views disagree: an arm whose errors vary smoothly with its posture, and
 single views that are wrong. Both are in the evidence of either side (`linear`), with the sizes of the arm's
-errors and of the change averaged out. An arm that changes its configuration, an elbow or a wrist, errs
-differently from then on: a step at the same place, of the size of its other errors, is a rival, too. So the
-ratio of the evidences, a Bayes factor, is at least 1/α in a share of at most α of the recordings in which
-nothing changed (Markov's inequality): one stated probability of a false claim is the only threshold.
+errors and of the change averaged out. Where joints are not known there is one more rival: an arm that changes
+its configuration, an elbow or a wrist, errs differently from then on, by a step of the size of its other
+errors. The ratio of the evidences, a Bayes factor, is at least 1/α in a share of at most α of the recordings
+in which nothing changed (Markov's inequality): one stated probability of a false claim is the only threshold.
 """
 
 from __future__ import annotations
@@ -182,11 +182,22 @@ class _Weighed:
 class ChangeSearch:
     """All changes of one recording, weighed against none."""
 
-    def __init__(self, views: PoseViews, errors: Array, as_recorded: PoseFit, seed: int = 0) -> None:
-        """Take the errors by posture (n, 6, q), as of `errors_by_posture`, and the fit without a change."""
+    def __init__(
+        self,
+        views: PoseViews,
+        errors: Array,
+        as_recorded: PoseFit,
+        seed: int = 0,
+        joints_known: bool = False,
+    ) -> None:
+        """Take the errors by posture (n, 6, q), as of `errors_by_posture`, and the fit without a change.
+
+        joints_known: the errors hold those of the arm's links, which follow its configuration.
+        """
         self._views = views
         self._errors = errors
         self._seed = seed
+        self._joints_known = joints_known
         self._fit = as_recorded
         state = _State(as_recorded.X[0], as_recorded.Y[0], as_recorded.factors)
         self._linear = self._linearised(state)
@@ -209,8 +220,9 @@ class ChangeSearch:
             weighed = [one for at in dict.fromkeys(tried) if (one := self._weighed(kind, at))]
             if weighed:
                 found[kind] = max(weighed, key=lambda one: special.logsumexp(one.logs))
-        steps = [one.log_step - np.log(len(self._places)) for one in found.values()]
-        rivals = [one.log_none for one in found.values()] + steps
+        rivals = [one.log_none for one in found.values()]
+        if not self._joints_known:
+            rivals += [one.log_step - np.log(len(self._places)) for one in found.values()]
         return [self._change(kind, one, len(kinds), max(rivals)) for kind, one in found.items()]
 
     def _promising(self, kind: Reading, kinds: int) -> list[int]:

@@ -194,7 +194,7 @@ def explain_changes(
         return none
     errors = errors_by_posture(views.flange, by_links)
     try:
-        found = ChangeSearch(views, errors, as_recorded, seed).found()
+        found = ChangeSearch(views, errors, as_recorded, seed, by_links is not None).found()
     except np.linalg.LinAlgError:
         return none
     likeliest = max(found, key=lambda change: change.log_bayes, default=None)

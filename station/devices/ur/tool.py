@@ -191,9 +191,9 @@ class TcpCheck:
         if length_m > LONGEST_M:
             raise RobotError("tcp-too-far", model=model.name, distance_m=length_m, limit_m=LONGEST_M)
         if self._stated is not None:
-            stated = pose_from_vector(self._stated)
-            _compare(self._first, stated, _widened(self._tolerance, first), "tcp-mismatch", model.name)
-            self._first = stated
+            stated_tool = pose_from_vector(self._stated)
+            _compare(self._first, stated_tool, _widened(self._tolerance, first), "tcp-mismatch", model.name)
+            self._first = stated_tool
 
     def _try_controllers_model(self, model: RobotModel, first: RobotState) -> None:
         """Use the controller's own kinematics if they explain its tool pose.

@@ -45,6 +45,8 @@ FOCAL = 1
 """Index of the focal length among the factors of `pose_views`."""
 _POSE = 6
 """Numbers of a change of pose; a focal length has one."""
+_BOARD_SIZE = 12
+"""Index of the board's size among the unknowns, behind X and Y."""
 _SIZES = np.array([0.03, 0.12, 0.48])
 """1σ of the arm's errors, mm and mrad, from what no view can tell from none."""
 _CHANGE_SIZES = 1e-4 * 4.0 ** np.arange(6)
@@ -224,6 +226,18 @@ class ChangeSearch:
         if not self._joints_known:
             rivals += [one.log_step - np.log(len(self._places)) for one in found.values()]
         return [self._change(kind, one, len(kinds), max(rivals)) for kind, one in found.items()]
+
+    def board_size(self) -> tuple[float, float]:
+        """Compute true over assumed size of the board and its 1σ beside errors of the arm.
+
+        An arm whose places are told too near to each other makes the board seem larger: the fit without such
+        errors is too sure. Sizes of the errors are weighed by their evidence.
+        """
+        factors = self._fit.factors[0] + np.array([one.step[_BOARD_SIZE] for one in self._none])
+        variances = np.array([np.linalg.inv(one.precision)[_BOARD_SIZE, _BOARD_SIZE] for one in self._none])
+        weights = special.softmax([one.log_evidence for one in self._none])
+        factor = float(weights @ factors)
+        return factor, float(np.sqrt(weights @ (variances + (factors - factor) ** 2)))
 
     def _promising(self, kind: Reading, kinds: int) -> list[int]:
         """Find the place that is best beside the fit without a change, where a change may win at all.

@@ -31,6 +31,7 @@ from calibrate.imported.sets import (
 from calibrate.imported.table_readings import (
     TableReading,
     decide,
+    guessed_size,
     is_good,
     table_readings,
     without_boards_own,
@@ -431,10 +432,10 @@ def _board(best: TableReading) -> tuple[BoardSpec, str]:
     board = best.seen.board
     if best.seen.square_known:
         return board, "as described"
-    factor = float(best.fit.factors[0])
-    share = float(np.sqrt(np.linalg.inv(best.fit.solved.precision)[-2, -2])) / factor
+    factor, sigma = guessed_size(best)
     square_mm = 1e3 * factor * GUESSED_M
-    sigma_mm = share * square_mm
+    sigma_mm = 1e3 * sigma * GUESSED_M
+    share = sigma / factor
     usual = [size for size in _USUAL_SQUARES_MM if abs(size - square_mm) < _FITS_SIGMAS * sigma_mm]
     if len(usual) > 1:
         raise ImportSourceError(

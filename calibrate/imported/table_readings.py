@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calibrate.boards.model import has_markers
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.board_motion import BoardMotion, board_extent_m, boards_own_motion
+from calibrate.handeye.changes import ChangeSearch, errors_by_posture
 from calibrate.handeye.pose_fit import (
     FREE,
     PoseFit,
@@ -214,6 +215,12 @@ def _fitted(
 
 def _pose_views(views: ViewSet, seen: Seen) -> PoseViews:
     return pose_views(views, 0.02, 0.003 if seen.square_known else FREE)
+
+
+def guessed_size(reading: TableReading) -> tuple[float, float]:
+    """(true over assumed size of the board, 1σ) by the arm's motion, errors of the arm included."""
+    poses = _pose_views(reading.views, reading.seen)
+    return ChangeSearch(poses, errors_by_posture(poses.flange), reading.fit).board_size()
 
 
 def without_boards_own(held: Contents, readings: list[TableReading]) -> list[TableReading]:

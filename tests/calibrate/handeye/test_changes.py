@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from benchmarks.moved import MOUNTS, measure, moved_cell
-from calibrate.handeye.pose_fit import pose_views
+from calibrate.handeye.changes import ChangeSearch, errors_by_posture
+from calibrate.handeye.pose_fit import FREE, fit_poses, pose_views
 from calibrate.handeye.readings import explain_changes, explain_recording, explain_text
 from calibrate.handeye.solution import Reading
 from recordings.geometry import perturb
 from tests.calibrate.cells import MID, make_cell, slipped, with_flange
+from tests.calibrate.chains import arm_cell
 
 SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])
 
@@ -59,3 +61,16 @@ def test_a_cause_carries_the_rivals_that_it_was_held_against():
     assert all(rival.excluded for rival in held.values())
     gains = [rival.log_evidence_gain for rival in found.rivals]
     assert gains == sorted(gains, reverse=True) and gains[0] < found.log_evidence_gain
+
+
+def test_a_boards_size_that_the_arms_motion_tells_is_within_what_is_stated_of_it():
+    """The fit that knows no errors of the arm says three times too little."""
+    found = []
+    for seed in range(6):
+        for mount in MOUNTS:
+            cell = arm_cell(("ur", "spherical wrist")[seed % 2], mount, 0.4, seed, 20, joints=False)
+            views = pose_views(cell.views, focal_sigma=0.02, size_sigma=FREE)
+            search = ChangeSearch(views, errors_by_posture(views.flange), fit_poses(views))
+            factor, sigma = search.board_size()
+            found.append((factor - 1) / sigma)
+    assert np.sqrt(np.mean(np.square(found))) < 2.1

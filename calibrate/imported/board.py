@@ -44,6 +44,8 @@ _LARGEST_SIDE_PX = 1000
 """Images are judged reduced to this size: their corners need not be exact."""
 _TRIED = 6
 """Images on which a board is tried at a glance; misses in a row after which a thorough search gives up."""
+_ANOTHER = 2
+"""Images that show another board: one alone may be a mistake of the detector."""
 _ENOUGH = 0.4
 """Share of the images that show the board at a glance above which the others are left at that."""
 
@@ -68,6 +70,8 @@ class Seen:
     """How the poses that were told are read; None: images show the board."""
     told: str = ""
     """Evidence for it."""
+    another: tuple[BoardSpec, int] | None = None
+    """Another board, and how many of the images that do not show this one show it."""
 
 
 def told_boards(table: Table) -> Iterator[Seen]:
@@ -111,8 +115,15 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
     factor = min(1.0, _LARGEST_SIDE_PX / max(width, height))
     small = {path: _reduced(image, factor) for path, image in images.items()}
     greys = list(small.values())
-    boards = [(given, None)] if given else chain(_described(held.facts), _shown(greys))
-    for board, known in _likely(boards, greys[:_TRIED], progress)[:2]:
+    few = [greys[place] for place in _spread(len(greys), _TRIED)]
+    if given:
+        likely = _likely([(given, None)], few, progress)
+    else:
+        likely = _likely(chain(_described(held.facts), _shown(greys)), few, progress)
+        if not any(each.often and (each.known or each.board.kind is BoardKind.CHESSBOARD) for each in likely):
+            likely += _likely(_shown_circles(greys), few, progress)
+    for each in sorted(likely, key=_Tried.rank)[:2]:
+        board, known = each.board, each.known
         points = board_points(board)
         found = dict(_search(small, board, known, progress))
         views: dict[Key, BoardView] = {
@@ -131,8 +142,21 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
         camera = _camera(held, CameraModel(width, height), tuple(views.values()))
         if camera is not None:
             candidates = {path: candidate_poses(view, camera[0], board) for path, view in views.items()}
-            return Seen(board, known, views, candidates, *camera, len(images), greys)
+            without = [small[path] for path in images if path not in views]
+            another = _another(board, [tried.board for tried in likely], without)
+            return Seen(board, known, views, candidates, *camera, len(images), greys, another=another)
     return None
+
+
+def _another(board: BoardSpec, boards: list[BoardSpec], images: list[Grey]) -> tuple[BoardSpec, int] | None:
+    """Find the other board that most of `images` show, where two do: a set of two boards is told apart."""
+    counts = [
+        (sum(detect(image, other, thorough=False).found for image in images), other)
+        for other in boards
+        if (other.kind, other.columns, other.rows) != (board.kind, board.columns, board.rows)
+    ]
+    count, other = max(counts, key=lambda each: each[0], default=(0, board))
+    return (other, count) if count >= _ANOTHER else None
 
 
 def _reduced(image: Grey, factor: float) -> Grey:
@@ -158,33 +182,53 @@ def _search(
                 yield path, seen
 
 
+@dataclass(frozen=True)
+class _Tried:
+    """A board that was looked for at a glance in a few images."""
+
+    board: BoardSpec
+    known: bool
+    """Its size is told."""
+    corners: int
+    """That were seen in all of them."""
+    often: bool
+    """Half of them show it."""
+
+    def rank(self) -> tuple[bool, int]:
+        """What is described and seen comes first, then who shows more corners."""
+        return not (self.known and self.often), -self.corners
+
+
 def _likely(
     boards: Iterable[tuple[BoardSpec, Grey | None]], images: list[Grey], progress: Progress
-) -> list[tuple[BoardSpec, bool]]:
-    """Boards and whether their size is known: as they come where half of a few images show one at a glance,
-    the others by the corners that are seen. One that an image suggested must first be found in that one."""
-    counted: list[tuple[int, BoardSpec, bool]] = []
+) -> list[_Tried]:
+    """Try boards at a glance, until one whose size is told is often seen. One that an image suggested must
+    first be found in that one."""
+    tried: list[_Tried] = []
     for n, (each, shown) in enumerate(boards):
         known = each.square_m > 0
         board = each if known else msgspec.structs.replace(each, square_m=GUESSED_M)
         progress(n, n + 1, f"trying a {board.kind.value} {board.columns}×{board.rows}")
-        part = any(
-            (shown is not None and not knew and board.kind is larger.kind is not BoardKind.CHESSBOARD)
-            and (board.columns <= larger.columns and board.rows <= larger.rows)
-            for _, larger, knew in counted
-        )  # of circles that one image shows whole; `detect` itself takes no part of a chessboard
+        part = shown is not None and any(
+            _is_part(board, larger.board) for larger in tried if not larger.known
+        )
         try:
             if part or (shown is not None and not detect(shown, board, True, False).found):
                 continue
             seen = [detect(image, board, False) for image in images]
         except CalibrationError:
             continue
-        often = 2 * sum(found.found for found in seen) >= len(seen) and known
-        corners = sum(found.corners for found in seen)
-        counted.append((-(10**6) if often else -corners, board, known))
-        if often:
+        often = 2 * sum(found.found for found in seen) >= len(seen)
+        tried.append(_Tried(board, known, sum(found.corners for found in seen), often))
+        if often and known:
             break
-    return [(board, known) for _, board, known in sorted(counted, key=lambda c: c[0])]
+    return tried
+
+
+def _is_part(board: BoardSpec, larger: BoardSpec) -> bool:
+    """Tell whether circles are some of a larger grid's. `detect` itself takes no part of a chessboard."""
+    same = board.kind is larger.kind is not BoardKind.CHESSBOARD
+    return same and board.columns <= larger.columns and board.rows <= larger.rows
 
 
 def _camera(
@@ -266,7 +310,7 @@ def _sides(facts: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
-    """Boards of unknown size that images suggest: a tag that most of a few show, chessboards, circles."""
+    """Boards of unknown size that images suggest: a tag that most of a few show, and chessboards."""
     few = greys[:: max(1, len(greys) // _TRIED)]
     for dictionary in _DICTIONARIES:
         detector = marker_detector(dictionary, 1)
@@ -283,6 +327,11 @@ def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
         sizes.setdefault(whole, sizes[max(sizes, key=lambda size: size[0] * size[1])])
     for size in sorted(sizes, key=lambda size: -size[0] * size[1])[: _TRIED + 2]:
         yield BoardSpec(BoardKind.CHESSBOARD, *size), sizes[size]
+
+
+def _shown_circles(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
+    """Grids of circles that images suggest: to count circles takes longer than anything else here."""
+    few = greys[:: max(1, len(greys) // _TRIED)]
     counts = [count_circles(grey) for grey in few]
     for count, times in Counter(counts).most_common(2):
         alike = [grey for grey, circles in zip(few, counts, strict=True) if circles == count]

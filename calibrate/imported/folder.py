@@ -352,6 +352,10 @@ def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
         "board": (f"{board.kind.value} {board.columns}×{board.rows}, {1e3 * board.square_m:g} mm", square),
         "camera": ("matrix as told" if seen.camera_known else "to be estimated", ""),
     }
+    if seen.another is not None:
+        other, shown = seen.another
+        name = f"{other.kind.value} {other.columns}×{other.rows}"
+        facts["another"] = name, f"in {shown} of {seen.looked} images looked at, which are not used"
     camera = seen.camera if seen.camera_known else CameraModel(seen.camera.width, seen.camera.height)
     if joints:
         facts["joints"] = f"{len(joints.numbers)} rows of {joints.name}", "they move as the poses do"

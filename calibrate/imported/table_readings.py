@@ -43,7 +43,8 @@ _MOST = 12
 """Most readings of one table that are fitted: those by which the board seems to move least."""
 _HOPELESS = 10.0
 _STANDS_M = 0.001
-"""A reading by which the board moves so many times as far as by the best, or as this length, is not tried."""
+"""Where another reading fits, one by which the board moves so many times as far as by the best, or as this
+length, is not tried."""
 _EXPLAINED = 4
 """Most readings of a refused folder that are tried with their rows shifted, mirrored and the like."""
 _MOVES = 0.01
@@ -134,11 +135,14 @@ def table_readings(
     likely.sort(key=lambda each: each[0])
     farthest = _HOPELESS * max(likely[0][0], _STANDS_M) if likely else 0.0
     as_told = [each for each in likely if each[2] == _AS_TOLD][:_MOST]
-    untold = [each for each in likely if each[2] != _AS_TOLD and each[0] < farthest]
-    others = list(_once(untold))[:_MOST]
-    for _, how, evidence, flange, seen, keys, mount in as_told + others:
+    others = list(_once([each for each in likely if each[2] != _AS_TOLD]))[:_MOST]
+    any_fits = False
+    for moved, how, evidence, flange, seen, keys, mount in as_told + others:
+        if any_fits and evidence != _AS_TOLD and moved > farthest:
+            continue
         fitted = _fitted(seen, keys, flange, mount)
         if fitted is not None:
+            any_fits = True
             yield TableReading(table, how, family, pairs, seen, mount, *fitted, evidence)
 
 

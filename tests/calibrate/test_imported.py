@@ -426,3 +426,26 @@ def test_moveits_own_pairs_give_what_its_test_expects(tmp_path: Path) -> None:
     solution = solve_recording(rec).solution
     np.testing.assert_allclose(solution.matrix[:3, 3], [0.659, -0.249, 0.830], rtol=0.01)
     assert solution.certificate.certified
+
+
+@pytest.mark.parametrize("counts", [(8, 8), (12, 6), (6, 14)])
+def test_two_boards_in_a_set_are_told_apart(counts: tuple[int, int], tmp_path: Path) -> None:
+    """The one that more corners show is taken alone, and the other one is named."""
+    boards = BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025), BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.02)
+    poses: list[np.ndarray] = []
+    for seed, (shown, count) in enumerate(zip(boards, counts, strict=True)):
+        recording = open_recording(
+            write_session(tmp_path / f"{seed}.mcap", Scene(shown, views=count, seed=seed))
+        )
+        for view, image in recording.images():
+            poses.append(np.array(view.base_from_flange))
+            cv2.imwrite(str(tmp_path / f"{len(poses):02d}.png"), image.pixels)
+        (tmp_path / f"{seed}.mcap").unlink()
+    np.savetxt(tmp_path / "robot.txt", quaternions(np.array(poses)))
+    found = believe(look(tmp_path), Given(mount="eye-in-hand"))
+    taken = found.dataset.board
+    (true,) = (each for each in boards if (each.columns, each.rows) == (taken.columns, taken.rows))
+    (other,) = (each for each in boards if each is not true)
+    assert taken.square_m == pytest.approx(true.square_m, rel=0.01)
+    assert f"{other.columns}×{other.rows}" in found.facts["another"][0]
+    assert "outliers" not in found.facts

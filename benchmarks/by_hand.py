@@ -27,8 +27,8 @@ from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import camera_matrix, distortion, project
-from calibrate.views import BoardView, ViewSet
+from calibrate.views.projection import camera_matrix, distortion, project
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from recordings.schema.stillness import WINDOW_S, scatter

@@ -14,13 +14,13 @@ import numpy as np
 from benchmarks.imperfect_cells import Imperfection, Known, imperfect_cell
 from benchmarks.trials import Miss, rms, rows_of, table, trials
 from calibrate.errors import CalibrationError
-from calibrate.gates import judge
 from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.pairs import all_pairs, mount_poses
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import LensModel
+from calibrate.pipeline.gates import judge
+from calibrate.pipeline.job import single_threaded_opencv
 from recordings.schema.messages import Mount
 
 TRIALS = 200

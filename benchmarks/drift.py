@@ -17,7 +17,7 @@ from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array
 from recordings.schema.messages import Mount
 from tests.calibrate.chains import arm_cell, later_views

@@ -13,12 +13,12 @@ import msgspec
 import numpy as np
 
 from benchmarks.scene import MID, grid
+from calibrate.arms.kinematics import MODELS, forward
 from calibrate.handeye.noise_scales import MeasurementNoise
-from calibrate.kinematics import MODELS, forward
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project
-from calibrate.views import BoardView, ViewSet
+from calibrate.views.projection import project
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from tests.calibrate.cells import inverse_nearest

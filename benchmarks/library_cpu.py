@@ -1,7 +1,7 @@
 """CPU that a public solve costs a program that sets no threads, against one that sets one BLAS thread.
 
 Both run side by side, in processes of their own, on idle cores and beside two busy loops. The ratio is what
-`calibrate.blas_threads` is for: it is 1 where the library itself sees to it.
+`calibrate.handeye.blas_threads` is for: it is 1 where the library itself sees to it.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from benchmarks.real_sets import DATASETS
 from benchmarks.trials import table
 from calibrate.errors import CalibrationError
 from calibrate.imported import Given, believe, board
-from calibrate.job import single_threaded_opencv, solve_recording
+from calibrate.pipeline.job import single_threaded_opencv, solve_recording
 from recordings.errors import ImportSourceError
 from recordings.geometry import Array, inverse
 from recordings.importers.dataset import Dataset, read_dataset, read_poses

@@ -27,7 +27,7 @@ from benchmarks.trials import table
 from calibrate.boards.detect import Detection, detect
 from calibrate.errors import CalibrationError
 from calibrate.handeye.solution import Reading
-from calibrate.job import solve_recording
+from calibrate.pipeline.job import solve_recording
 from recordings.errors import RecordingError
 from recordings.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, rotation_log
 from recordings.importers.dataset import DATASET_FILE, HEADER, read_dataset, read_poses
@@ -312,5 +312,5 @@ def remembered_detections() -> Iterator[None]:
             known[key] = detect(image, spec, **options)
         return known[key]
 
-    with patch("calibrate.recorded_views.detect", remembered):
+    with patch("calibrate.pipeline.recorded_views.detect", remembered):
         yield

@@ -14,7 +14,7 @@ from calibrate.errors import CalibrationError
 from calibrate.handeye.solution import Reading, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.pnp import solve_pnp
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, pose
 from recordings.schema.messages import Mount
 from tests.calibrate.chains import CAMERA, arm_cell, in_sight, views_at

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibrate.job import JobOptions, solve_recording
+from calibrate.pipeline.job import JobOptions, solve_recording
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel
 from tests.calibrate.sessions import Scene, write_session
@@ -26,7 +26,7 @@ LARGE = CameraModel(
 _PEAK = """
 import json, resource, sys
 from pathlib import Path
-from calibrate.job import solve_recording
+from calibrate.pipeline.job import solve_recording
 solve_recording(Path(sys.argv[1]))
 print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
 """

@@ -11,12 +11,12 @@ from benchmarks.imperfect_cells import BOARD, ImperfectCell, Known, imperfect_ce
 from benchmarks.scene import MID
 from benchmarks.trials import Miss, rows_of, table, trials
 from calibrate.errors import CalibrationError
-from calibrate.gates import judge
 from calibrate.handeye.solution import Reading, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.job import single_threaded_opencv
 from calibrate.lens.pnp import solve_pnp
-from calibrate.views import BoardView, Places, ViewSet
+from calibrate.pipeline.gates import judge
+from calibrate.pipeline.job import single_threaded_opencv
+from calibrate.views.view_set import BoardView, Places, ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from recordings.schema.messages import Mount
 

@@ -25,14 +25,14 @@ from benchmarks.random_cells import (
 )
 from benchmarks.scene import MID
 from benchmarks.trials import percentiles, rms, rms_spread, table, trials
+from calibrate.arms.kinematics import forward
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.reprojection import bent_points
-from calibrate.kinematics import forward
-from calibrate.projection import project
 from calibrate.results import SHAPE
-from calibrate.views import Observations, extent_of
+from calibrate.views.projection import project
+from calibrate.views.view_set import Observations, extent_of
 from recordings.geometry import Array, difference, perturb
 from station.cell.errors import LimitError
 from station.cell.layout import layout_of

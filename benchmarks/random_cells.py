@@ -15,8 +15,8 @@ import cv2
 import msgspec
 import numpy as np
 
+from calibrate.arms.kinematics import MODELS, inverse_many, link_frames
 from calibrate.boards.model import board_points
-from calibrate.kinematics import MODELS, inverse_many, link_frames
 from recordings.geometry import Array, inverse, pose, rotation_exp
 from recordings.schema.messages import CameraModel
 from station.cell.config import (

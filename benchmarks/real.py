@@ -14,7 +14,7 @@ from benchmarks import real_arms
 from benchmarks.real_methods import FAILURES, Answer, calibration_rs, opencv, ours, predicted_centre
 from benchmarks.real_sets import DATASETS, RealSet, real_sets
 from benchmarks.trials import table
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, difference
 
 FOLDS = 5

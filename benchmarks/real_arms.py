@@ -16,16 +16,16 @@ import numpy as np
 
 from benchmarks.real_sets import read_set
 from benchmarks.trials import in_processes, rms, table
-from calibrate.chain import learn_chain
+from calibrate.arms.chain import learn_chain
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
 from calibrate.handeye.metrics import mean_pose
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.views import Places, ViewSet
+from calibrate.pipeline.job import single_threaded_opencv
+from calibrate.views.view_set import Places, ViewSet
 from recordings.geometry import Array, inverse, pose_from_quaternion, rotation_angle
 from recordings.schema.messages import BoardSpec
 

@@ -15,10 +15,10 @@ from calibrate.handeye.axxb.peer_methods import HAND_EYE, ROBOT_WORLD, opencv_ha
 from calibrate.handeye.reprojection import bent_points
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.views import BoardView, ViewSet, observe_views
+from calibrate.pipeline.job import single_threaded_opencv
+from calibrate.views.view_set import BoardView, ViewSet, observe_views
 from recordings.geometry import Array, inverse, pose_from_quaternion, quaternion_from_matrix
 from recordings.schema.messages import BoardSpec, CameraModel
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from calibrate.job import single_threaded_opencv
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.recorded_views import load_views
-from calibrate.views import ViewSet
+from calibrate.pipeline.job import single_threaded_opencv
+from calibrate.pipeline.recorded_views import load_views
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, project_to_rotation
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording

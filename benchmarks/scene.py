@@ -13,8 +13,8 @@ import numpy as np
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project
-from calibrate.views import BoardView, ViewSet
+from calibrate.views.projection import project
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import (
     Array,
     inverse,

@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.arms.chain import LearnedArm
+
 
 @dataclass(frozen=True)
 class Remark:
@@ -182,15 +184,6 @@ class BoardShape(msgspec.Struct, frozen=True):
     def numbers(self) -> NDArray[np.float64]:
         """(5,) in the order of `SHAPE`."""
         return np.array([self.scale, self.anisotropy, *self.bend_m])
-
-
-class LearnedArm(msgspec.Struct, frozen=True):
-    """The arm's kinematics as they were learned: `calibrate.chain.Chain`, metres and radians, in base."""
-
-    axes: tuple[tuple[float, ...], ...]
-    points: tuple[tuple[float, ...], ...]
-    posture_rad: tuple[float, ...]
-    flange: tuple[tuple[float, ...], ...]
 
 
 class Posterior(msgspec.Struct, frozen=True, omit_defaults=True):

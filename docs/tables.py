@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from calibrate.files.exports import FORMATS
-from calibrate.gates import GateLimits
+from calibrate.pipeline.gates import GateLimits
 
 texts_of_fields: Callable[[type], dict[str, str]] = runpy.run_path(
     str(Path(__file__).with_name("structs.py"))
@@ -42,7 +42,7 @@ def formats() -> Iterator[str]:
 
 
 PAGES = {
-    "gates": ("Gates", "calibrate/gates.py", gates),
+    "gates": ("Gates", "calibrate/pipeline/gates.py", gates),
     "formats": ("Export formats", "calibrate/files/exports/", formats),
 }
 

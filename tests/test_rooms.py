@@ -20,7 +20,7 @@ SCREEN = ("numpy", "scipy", "cv2", "textual", "calibrate")
 HARDWARE = ("textual", "serial", "rtde_control", "gi")
 NOT_LOADED = {
     "import recordings.cli.app, calibrate, calibrate.handeye": HEAVY,
-    "import calibrate.job, calibrate.cli.importing, recordings.cli.commands": (*HARDWARE, "station"),
+    "import calibrate.pipeline.job, calibrate.cli.importing, recordings.cli.commands": (*HARDWARE, "station"),
     "import station.daemon": ("scipy", "matplotlib", "textual"),
     "import station.tui.app": ("scipy", "matplotlib", "station.session"),
     "calibrate --help": HEAVY,
@@ -46,12 +46,12 @@ def test_what_is_not_used_is_not_loaded(program: str) -> None:
 
 
 PLANTS = [
-    ("recordings/mcap", "calibrate.views"),
+    ("recordings/mcap", "calibrate.views.view_set"),
     ("recordings/mcap", "recordings.reader"),
     ("recordings/schema", "rosbags"),
     ("calibrate/files", "station.cell"),
     ("calibrate/handeye", "calibrate.files"),
-    ("calibrate/boards", "calibrate.job"),
+    ("calibrate/boards", "calibrate.pipeline.job"),
     ("calibrate/check", "serial"),
     ("calibrate/check", "mcap"),
     ("station/analysis", "textual"),
@@ -99,7 +99,7 @@ READ_DIRECTLY = {
     "recordings/files.py",  # the one function
     "recordings/errors.py",  # a table of the package
     "recordings/importers/trees.py",  # an array of bytes that are read already
-    "calibrate/document.py",  # our own source
+    "calibrate/pipeline/document.py",  # our own source
     "station/protocol/stop_client.py",  # the page, by a program that loads little
     # the kernel's files
     "station/cell/process.py", "station/server/approval.py", "station/server/control_group.py",

@@ -11,8 +11,8 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, R, T
-from calibrate.document import solver_software
 from calibrate.errors import UsageError
+from calibrate.pipeline.document import solver_software
 
 _CONNECT_S = 30
 

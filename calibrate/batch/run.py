@@ -13,15 +13,15 @@ from pathlib import Path
 import cv2
 import msgspec
 
-from calibrate.arm_table import FramePose
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
-from calibrate.document import solver_software
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Sigma, encode_calibration, require_readable, write_encoded
 from calibrate.files.integrity import content_sha256
 from calibrate.files.lines import append_line, read_lines
-from calibrate.job import JobOptions, solve_recording
-from calibrate.resource_limits import Limits, bounded
+from calibrate.handeye.arm_table import FramePose
+from calibrate.pipeline.document import solver_software
+from calibrate.pipeline.job import JobOptions, solve_recording
+from calibrate.pipeline.resource_limits import Limits, bounded
 from recordings.errors import RecordingError
 from recordings.plain_text import plain_text
 

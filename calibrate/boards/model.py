@@ -63,6 +63,13 @@ def usual_markers(kind: BoardKind, square_m: float) -> tuple[float | None, str |
     return None, "DICT_4X4_50" if kind is BoardKind.ARUCO else None
 
 
+def board_of(given: BoardSpec | str) -> BoardSpec:
+    """Take a board as it is, or as it is typed ('8x5 30'). Raises BoardError where no such board exists."""
+    board = typed_board(given) if isinstance(given, str) else given
+    check_board(board)
+    return board
+
+
 def typed_board(text: str) -> BoardSpec:
     """Parse a typed board: '8x5 30' is a chessboard of 8 × 5 inner corners, squares of 30 mm.
 

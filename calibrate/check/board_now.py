@@ -17,7 +17,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.reprojection import bent_points
 from calibrate.lens.pnp import candidate_poses
-from calibrate.views import BoardView, ViewSet, observe_views
+from calibrate.views.view_set import BoardView, ViewSet, observe_views
 from recordings.geometry import Array, difference, inverse, skew
 
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03

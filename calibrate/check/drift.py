@@ -26,9 +26,9 @@ from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance, KnownBefore
 from calibrate.handeye.uncertainty import inverse_of
-from calibrate.projection import intrinsics_names
 from calibrate.results import SHAPE, DriftFigures
-from calibrate.views import ViewSet, extent_of, require_no_copies
+from calibrate.views.projection import intrinsics_names
+from calibrate.views.view_set import ViewSet, extent_of, require_no_copies
 from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec
 

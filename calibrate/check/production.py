@@ -22,7 +22,7 @@ from calibrate.handeye.mixture import GAIN, class_chances, expected
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.uncertainty import inverse_of
-from calibrate.views import ViewSet, require_no_copies
+from calibrate.views.view_set import ViewSet, require_no_copies
 from recordings.geometry import Array
 
 EARLIER, MOST_EARLIER = 60, 300

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from calibrate.annotate import annotate as draw
 from calibrate.cli.output import detection_progress, out
 from calibrate.files.calibration import read_calibration
+from calibrate.report.annotate import annotate as draw
 from recordings.reader import open_recording
 
 

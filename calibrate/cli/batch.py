@@ -19,9 +19,9 @@ from calibrate.cli.inputs import read_limits
 from calibrate.cli.output import err, out
 from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit
 from calibrate.errors import UsageError
-from calibrate.job import JobOptions
-from calibrate.recorded_views import Progress as LoadProgress
-from calibrate.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
+from calibrate.pipeline.job import JobOptions
+from calibrate.pipeline.recorded_views import Progress as LoadProgress
+from calibrate.pipeline.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from recordings.cli.console import progress_bar
 
 DONE_WITH_LOSS = 3

@@ -6,9 +6,9 @@ from typing import Literal
 
 import msgspec
 
-from calibrate.arm_table import CorrectedArm, FramePose
 from calibrate.files.calibration import Lens, SessionReading, Sigma, Views
 from calibrate.files.validity import Validity
+from calibrate.handeye.arm_table import CorrectedArm, FramePose
 from calibrate.results import (
     Arm,
     BoardShape,

@@ -28,7 +28,7 @@ from calibrate.files.install import note_check
 from calibrate.files.validity import ValidityReason, validity_text
 from calibrate.files.versions import installed_versions, same_solve
 from calibrate.handeye.posterior import KnownCell
-from calibrate.job import JobOptions, PreparedViews, prepare_views
+from calibrate.pipeline.job import JobOptions, PreparedViews, prepare_views
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.importers.dataset import DATASET_FILE
 from recordings.importers.folder import import_folder

@@ -11,12 +11,12 @@ from typing import Annotated
 import msgspec
 import typer
 
-from calibrate.arm_table import FramePose
 from calibrate.cli.installed import CameraName, Root
 from calibrate.files.calibration import Lens
 from calibrate.files.formatting import SOURCE_STAMPS
 from calibrate.files.loader import InstallationChange, watch
 from calibrate.files.validity import Validity, validity_text
+from calibrate.handeye.arm_table import FramePose
 from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import Mount, Source
 

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from calibrate.boards.model import typed_board
 from calibrate.imported import Given, believe, is_described
-from calibrate.job import single_threaded_opencv
+from calibrate.pipeline.job import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.errors import (
     SeveralReadingsError,

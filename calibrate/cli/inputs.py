@@ -12,9 +12,9 @@ from calibrate.boards.model import check_board
 from calibrate.errors import UsageError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.integrity import FORMATS
-from calibrate.gates import GateLimits
 from calibrate.lens.intrinsics import LensModel
-from calibrate.projection import camera_matrix, distortion
+from calibrate.pipeline.gates import GateLimits
+from calibrate.views.projection import camera_matrix, distortion
 from recordings import strict_yaml
 from recordings.files import read_file
 from recordings.schema.messages import BoardSpec, CameraModel

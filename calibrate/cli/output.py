@@ -12,7 +12,7 @@ from typing import Literal
 
 from calibrate.errors import UsageError
 from calibrate.files.folders import VERSION_NAME
-from calibrate.recorded_views import Progress as LoadProgress
+from calibrate.pipeline.recorded_views import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
 from recordings.cli.console import OpenReport as OpenReport
 from recordings.cli.console import open_report as open_report

@@ -39,10 +39,10 @@ from calibrate.files.calibration import write_calibration, write_output
 from calibrate.files.formatting import summary
 from calibrate.files.install import install_line
 from calibrate.handeye.solution import camera_frames
-from calibrate.job import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 from calibrate.lens.intrinsics import LensModel
+from calibrate.pipeline.job import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
+from calibrate.pipeline.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits, bounded
 from calibrate.report.page import report_page
-from calibrate.resource_limits import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits, bounded
 from calibrate.results import PeerResult
 from recordings.geometry import roll_pitch_yaw
 

@@ -16,7 +16,6 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from calibrate.arm_table import CorrectedArm, FramePose
 from calibrate.errors import CalibrationFileError
 from calibrate.files.integrity import (
     check_result,
@@ -26,6 +25,7 @@ from calibrate.files.integrity import (
     verified_plain,
 )
 from calibrate.files.touch import Touch, agrees
+from calibrate.handeye.arm_table import CorrectedArm, FramePose
 from calibrate.results import (
     Arm,
     BoardShape,

@@ -1,8 +1,8 @@
 """Systematic errors of the arm and of a bracket that bends, to be estimated.
 
-The arm is a chain of axes: learned from the recorded joints (`calibrate.chain`), or a Universal Robots table
-that the recorded flanges follow. Each link but the last has a shift and a turn as its error. Without a chain,
-the flange itself has a shift and a turn that vary smoothly with its position.
+The arm is a chain of axes: learned from the recorded joints (`calibrate.arms.chain`), or a Universal Robots
+table that the recorded flanges follow. Each link but the last has a shift and a turn as its error. Without
+a chain, the flange itself has a shift and a turn that vary smoothly with its position.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.chain import Chain, LearnedChain, chain_of, learn_chain, read_otherwise, wrong_row
-from calibrate.kinematics import MODELS, RobotModel, inverse_many, with_near_axes
-from calibrate.views import ViewSet
+from calibrate.arms.chain import Chain, LearnedChain, chain_of, learn_chain, read_otherwise, wrong_row
+from calibrate.arms.kinematics import MODELS, RobotModel, inverse_many, with_near_axes
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, difference
 
 FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")

@@ -21,7 +21,7 @@ from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import Priors
 from calibrate.handeye.uncertainty import inverse_of
-from calibrate.views import Observations
+from calibrate.views.view_set import Observations
 from recordings.geometry import Array
 
 SIZES = 0.0075 * 2.0 ** np.arange(10)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.arm_table import CorrectedArm, FramePose, HeldOutViews
+from calibrate.arms.kinematics import DhTable, table_of_axes
 from calibrate.handeye.arm import ArmPostures
+from calibrate.handeye.arm_table import CorrectedArm, FramePose, HeldOutViews
 from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.solution import UncorrectedArm, camera_frames
 from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
-from calibrate.kinematics import DhTable, table_of_axes
 from recordings.geometry import Array, Transform, difference, perturb
 
 _NOMINAL_M = 1e-4

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, inverse, project_to_rotation, rotation_angle
 
 _TURN_RAD = np.radians(2.0)

@@ -18,7 +18,7 @@ from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.pose_fit import BoardPoses, agreed_start, pose_distances
 from calibrate.handeye.priors import Priors
 from calibrate.results import SHAPE
-from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views
+from calibrate.views.view_set import BoardView, Observations, Places, ViewSet, observe_views
 from recordings.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 
 STAGES = logging.getLogger("calibrate.stages")

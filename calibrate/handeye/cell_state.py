@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.results import SHAPE
-from calibrate.views import Observations, Places, implied_flange
+from calibrate.views.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
+from calibrate.views.view_set import Observations, Places, implied_flange
 from recordings.geometry import Array, difference, inverse_left_jacobian, perturb, skew
 from recordings.schema.messages import CameraModel, Mount
 

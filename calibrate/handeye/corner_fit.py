@@ -12,8 +12,8 @@ import numpy as np
 
 from calibrate.handeye.priors import LensPrior
 from calibrate.handeye.reprojection import corner_distance, corner_residuals, linearise_corners
-from calibrate.projection import intrinsics_vector, with_intrinsics_vector
-from calibrate.views import Observations
+from calibrate.views.projection import intrinsics_vector, with_intrinsics_vector
+from calibrate.views.view_set import Observations
 from recordings.geometry import Array, perturb
 from recordings.schema.messages import CameraModel
 

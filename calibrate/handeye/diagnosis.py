@@ -15,9 +15,9 @@ from calibrate.handeye.linear import Linear
 from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.solution import Finding
 from calibrate.handeye.uncertainty import inverse_of
-from calibrate.projection import intrinsics_vector
 from calibrate.results import CrossValidation, RejectedView
-from calibrate.views import Places, implied_flange
+from calibrate.views.projection import intrinsics_vector
+from calibrate.views.view_set import Places, implied_flange
 from recordings.geometry import Array, difference, skew
 
 _LOOSER = 0.01

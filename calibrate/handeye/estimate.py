@@ -19,7 +19,7 @@ from calibrate.handeye.linear import MAX_STEPS, Fit, Linear
 from calibrate.handeye.noise_scales import WIDE, Scales
 from calibrate.handeye.priors import KnownBefore, Priors
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
-from calibrate.views import Observations
+from calibrate.views.view_set import Observations
 from recordings.geometry import Array
 
 REJECTED = 0.05

@@ -13,15 +13,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibrate.blas_threads import one_blas_thread
+from calibrate.handeye.blas_threads import one_blas_thread
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
-from calibrate.projection import camera_matrix
 from calibrate.results import SHAPE
-from calibrate.views import Observations, array_of, board_in_camera, extent_of, require_mount
+from calibrate.views.projection import camera_matrix
+from calibrate.views.view_set import Observations, array_of, board_in_camera, extent_of, require_mount
 from recordings.geometry import Array
 from recordings.schema.messages import CameraModel, Mount
 

@@ -18,7 +18,7 @@ from calibrate.handeye.mixture import SHARE_COUNTS, class_chances, expected
 from calibrate.handeye.noise_scales import WIDE, Scales, update_corners, update_robot
 from calibrate.handeye.reprojection import linearise_corners
 from calibrate.handeye.uncertainty import information_lost, inverse_of
-from calibrate.views import Observations
+from calibrate.views.view_set import Observations
 from recordings.geometry import Array, perturb
 
 ROUNDS = 8

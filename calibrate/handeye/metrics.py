@@ -10,9 +10,9 @@ import numpy as np
 
 from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
 from calibrate.handeye.axxb.pairs import Pairs, screw_invariants
-from calibrate.projection import camera_matrix, distortion
 from calibrate.results import HoldoutScore
-from calibrate.views import BoardView, ViewSet, require_no_copies
+from calibrate.views.projection import camera_matrix, distortion
+from calibrate.views.view_set import BoardView, ViewSet, require_no_copies
 from recordings.errors import Value
 from recordings.geometry import Array, difference, is_rigid, pose, project_to_rotation, rotation_angle, skew
 from recordings.schema.messages import CameraModel

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from scipy import optimize
 
-from calibrate.blas_threads import one_blas_thread
 from calibrate.errors import CalibrationError
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import on_box, solve_paper
@@ -26,6 +25,7 @@ from calibrate.handeye.axxb.peer_methods import (
     zhao_minimax,
     zhi_linear,
 )
+from calibrate.handeye.blas_threads import one_blas_thread
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.metrics import (
@@ -42,10 +42,10 @@ from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.reprojection import corner_residuals
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_robust_profile
-from calibrate.projection import intrinsics_vector
 from calibrate.results import SHAPE
 from calibrate.results import PeerResult as PeerResult
-from calibrate.views import ViewSet, observe_views
+from calibrate.views.projection import intrinsics_vector
+from calibrate.views.view_set import ViewSet, observe_views
 from recordings.geometry import Array, inverse, is_rigid, perturb, rotation_log
 
 Method = Callable[[ViewSet], Array]

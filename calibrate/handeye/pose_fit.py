@@ -20,8 +20,8 @@ from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
 from calibrate.handeye.metrics import mean_pose
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.reprojection import linearise_corners
-from calibrate.projection import intrinsics_vector
-from calibrate.views import Places, ViewSet, implied_flange, observe_views
+from calibrate.views.projection import intrinsics_vector
+from calibrate.views.view_set import Places, ViewSet, implied_flange, observe_views
 from recordings.geometry import Array, difference, inverse, perturb, pose, rotation_log
 from recordings.schema.messages import Mount
 

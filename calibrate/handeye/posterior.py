@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibrate.chain import Chain, LearnedChain, as_rows, joint_readings
+from calibrate.arms.chain import Chain, LearnedChain, as_rows, joint_readings
 from calibrate.handeye.arm import (
     flange_extent,
     flex_motion,
@@ -21,9 +21,9 @@ from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.pose_fit import central_pose
 from calibrate.handeye.priors import BoardTolerance, KnownBefore
 from calibrate.handeye.uncertainty import inverse_of
-from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.results import SHAPE, Posterior
-from calibrate.views import Observations, ViewSet, observe_views
+from calibrate.views.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
+from calibrate.views.view_set import Observations, ViewSet, observe_views
 from recordings.geometry import Array, difference
 from recordings.schema.messages import CameraModel
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.errors import require_positive
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic
-from calibrate.projection import intrinsics_names, intrinsics_vector
+from calibrate.views.projection import intrinsics_names, intrinsics_vector
 from recordings.geometry import Array, difference
 from recordings.schema.messages import BoardSpec, CameraModel
 

@@ -19,7 +19,7 @@ from calibrate.handeye.changes import ChangeSearch, errors_by_posture, is_claime
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.pose_fit import FREE, BoardPoses, PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.solution import Explanation, Reading, Rival
-from calibrate.views import ViewSet, observe_views
+from calibrate.views.view_set import ViewSet, observe_views
 from recordings.geometry import (
     Array,
     inverse,

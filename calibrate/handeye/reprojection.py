@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.projection import intrinsics_names, project
 from calibrate.results import SHAPE
-from calibrate.views import Observations
+from calibrate.views.projection import intrinsics_names, project
+from calibrate.views.view_set import Observations
 from recordings.geometry import Array, skew
 from recordings.schema.messages import CameraModel
 

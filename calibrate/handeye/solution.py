@@ -12,8 +12,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from calibrate.arm_table import CorrectedArm
 from calibrate.errors import require_choice, require_positive
+from calibrate.handeye.arm_table import CorrectedArm
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
@@ -27,7 +27,7 @@ from calibrate.results import (
     RejectedView,
     Remark,
 )
-from calibrate.views import BoardView
+from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, Transform
 from recordings.schema.messages import CameraModel, Mount
 

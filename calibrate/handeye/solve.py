@@ -24,7 +24,6 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
-from calibrate.blas_threads import one_blas_thread
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.handeye.arm import FLEX
 from calibrate.handeye.arm_result import arm_results
@@ -32,6 +31,7 @@ from calibrate.handeye.axxb.certificate import TOLERANCE, certify
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective, pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
+from calibrate.handeye.blas_threads import one_blas_thread
 from calibrate.handeye.board_motion import board_extent_m, boards_own_motion
 from calibrate.handeye.cell_fit import STAGES, CellFit, fit_cell
 from calibrate.handeye.cell_state import Layout
@@ -74,11 +74,11 @@ from calibrate.handeye.solution import (
     board_frames,
     camera_frames,
 )
-from calibrate.projection import intrinsics_names
 from calibrate.results import Arm, ArmErrorValue, BoardShape, Certificate, HoldoutScore, Remark
-from calibrate.views import BoardView as BoardView
-from calibrate.views import ViewSet as ViewSet
-from calibrate.views import array_of
+from calibrate.views.projection import intrinsics_names
+from calibrate.views.view_set import BoardView as BoardView
+from calibrate.views.view_set import ViewSet as ViewSet
+from calibrate.views.view_set import array_of
 from recordings.geometry import Array, Transform, skew
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
+from calibrate.arms.kinematics import MODELS, RobotModel, forward, inverse_many
 from recordings.geometry import Array, matrix_from_quaternion, pose, skew
 from recordings.schema.messages import Mount
 

@@ -23,7 +23,7 @@ from calibrate.boards.model import board_points, usual_markers
 from calibrate.errors import CalibrationError
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import Candidate, candidate_poses
-from calibrate.views import NO_CORNERS, BoardView, ViewSet
+from calibrate.views.view_set import NO_CORNERS, BoardView, ViewSet
 from recordings.errors import ImportSourceError
 from recordings.files import read_file
 from recordings.image_headers import IMAGE_LIMIT_BYTES, ImageError, read_header

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibrate.chain import learn_chain
+from calibrate.arms.chain import learn_chain
 from calibrate.imported.directions import TOOL_POSE
 from calibrate.imported.scenery import mount_by_scene
 from calibrate.imported.table_readings import TableReading

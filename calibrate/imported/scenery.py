@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.boards.corners import Grey
-from calibrate.views import BoardView
+from calibrate.views.view_set import BoardView
 from recordings.geometry import Array
 from recordings.schema.messages import CameraModel, Mount
 

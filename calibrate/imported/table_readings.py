@@ -30,7 +30,7 @@ from calibrate.handeye.readings import clear_gain, explain_recording, explain_te
 from calibrate.handeye.solution import Explanation, Reading
 from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates, with_poses
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.errors import ImportSourceError, StandingReading, several_readings
 from recordings.geometry import Array, inverse, rotation_angle, rotation_log
 from recordings.importers.conventions import Convention, convention, possible, tells_direction

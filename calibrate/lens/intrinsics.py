@@ -18,8 +18,8 @@ from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.priors import LensPrior
 from calibrate.lens.pnp import planar_tilts
-from calibrate.projection import camera_matrix
-from calibrate.views import ViewSet, observe_views
+from calibrate.views.projection import camera_matrix
+from calibrate.views.view_set import ViewSet, observe_views
 from recordings.geometry import Array
 from recordings.schema.messages import CameraModel
 

@@ -16,8 +16,8 @@ from calibrate.boards.model import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
 from calibrate.handeye.axxb.pairs import screw_invariants
 from calibrate.handeye.corner_fit import fit_corners
-from calibrate.projection import camera_matrix, project_at, undistort
-from calibrate.views import BoardView, ViewSet, observe_views
+from calibrate.views.projection import camera_matrix, project_at, undistort
+from calibrate.views.view_set import BoardView, ViewSet, observe_views
 from recordings.geometry import Array, inverse, pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 

@@ -10,7 +10,6 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from calibrate.annotate import placed_corners
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import board_points, describe_board
 from calibrate.files.formatting import (
@@ -24,10 +23,11 @@ from calibrate.files.formatting import (
     use_text,
     verdict_text,
 )
-from calibrate.job import SolvedRecording
-from calibrate.projection import intrinsics_names, intrinsics_vector, project_at
+from calibrate.pipeline.job import SolvedRecording
 from calibrate.report import html
-from calibrate.views import board_in_camera
+from calibrate.report.annotate import placed_corners
+from calibrate.views.projection import intrinsics_names, intrinsics_vector, project_at
+from calibrate.views.view_set import board_in_camera
 from recordings import strict_yaml
 from recordings.geometry import Array, difference
 from recordings.images import viewable

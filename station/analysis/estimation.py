@@ -21,7 +21,7 @@ from calibrate.handeye.pose_fit import PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.views import BoardView, ViewSet
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.errors import RecordingError
 from recordings.geometry import Array
 from recordings.images import viewable

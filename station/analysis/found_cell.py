@@ -15,7 +15,7 @@ import numpy as np
 from calibrate.errors import CalibrationError
 from calibrate.handeye.pose_fit import FREE, fit_poses, pose_views
 from calibrate.handeye.solution import Reading
-from calibrate.views import ViewSet, implied_flange
+from calibrate.views.view_set import ViewSet, implied_flange
 from recordings.geometry import difference
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import (

@@ -22,8 +22,8 @@ from calibrate.handeye.information import (
 )
 from calibrate.handeye.metrics import median_distance_m
 from calibrate.lens.pnp import candidate_poses, solve_pnp
-from calibrate.projection import project
-from calibrate.views import ViewSet, implied_flange
+from calibrate.views.projection import project
+from calibrate.views.view_set import ViewSet, implied_flange
 from recordings.geometry import Array, pose, rotation_angle, rotation_exp, rotation_log, transform_points
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import as_views

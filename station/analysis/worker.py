@@ -21,7 +21,7 @@ from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError
 from calibrate.lens.pnp import planar_tilts
-from calibrate.views import BoardView
+from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, transform_points
 from recordings.images import Pixels, eight_bits, viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image

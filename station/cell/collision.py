@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from calibrate.kinematics import RobotModel, link_frames
+from calibrate.arms.kinematics import RobotModel, link_frames
 from recordings.geometry import Array, transform_points
 from recordings.schema.messages import Mount
 from station.cell.config import Capsule, LimitsConfig, vector3

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from calibrate.arms.kinematics import MODELS, forward
 from calibrate.boards.model import BoardError, check_board
-from calibrate.kinematics import MODELS, forward
 from recordings import strict_yaml
 from recordings.files import read_file
 from recordings.schema.messages import CameraModel

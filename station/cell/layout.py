@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calibrate.arms.kinematics import MODELS, RobotModel, forward, with_near_axes
 from calibrate.boards.model import board_points
-from calibrate.kinematics import MODELS, RobotModel, forward, with_near_axes
-from calibrate.projection import camera_matrix
-from calibrate.views import board_in_camera, implied_flange
+from calibrate.views.projection import camera_matrix
+from calibrate.views.view_set import board_in_camera, implied_flange
 from recordings.geometry import (
     Array,
     inverse,

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibrate.kinematics import JOINT_NAMES, forward
+from calibrate.arms.kinematics import JOINT_NAMES, forward
 from recordings.geometry import Array, difference
 from station.cell.collision import SPACING_M, CellGeometry, Contact, margins, moving_points, surface_speeds
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2, SPEED_CAP_M_S, LimitsConfig

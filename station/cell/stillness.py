@@ -14,7 +14,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from calibrate.kinematics import JOINT_NAMES
+from calibrate.arms.kinematics import JOINT_NAMES
 from recordings.geometry import pose_from_rotvec
 from recordings.schema.messages import RobotState, Stillness
 from recordings.schema.stillness import LEAST_SAMPLES, scatter

@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from calibrate.boards.model import board_points
-from calibrate.views import board_in_camera
+from calibrate.views.view_set import board_in_camera
 from recordings.files import ASKED_FOR, read_file, write_atomically
 from recordings.geometry import Array, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel

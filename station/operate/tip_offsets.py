@@ -19,7 +19,7 @@ from calibrate.files.folders import VERSION_NAME
 from calibrate.files.touch import Touch
 from calibrate.files.validity import time_text
 from calibrate.files.versions import note_in_file, note_installed, who
-from calibrate.views import BoardView
+from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, base_from_flange, inverse, transform_points
 from station.cell.config import Vector3
 from station.cell.errors import RefusedError

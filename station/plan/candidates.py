@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.kinematics import inverse_many, singularity_measure
+from calibrate.arms.kinematics import inverse_many, singularity_measure
 from recordings.geometry import Array
 from station.cell.collision import Contact, margins
 from station.cell.layout import CellLayout

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from calibrate.arms.chain import chain_of
 from calibrate.boards.model import board_points
-from calibrate.chain import chain_of
 from calibrate.handeye.information import (
     USUAL_NOISE,
     covariance_of,
@@ -19,7 +19,7 @@ from calibrate.handeye.information import (
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
-from calibrate.projection import intrinsics_names
+from calibrate.views.projection import intrinsics_names
 from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.layout import CellLayout

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from calibrate.arms.kinematics import forward
 from calibrate.boards.model import board_points
 from calibrate.handeye.information import USUAL_NOISE, predicted_error_m
 from calibrate.handeye.metrics import median_distance_m
 from calibrate.handeye.noise_scales import MeasurementNoise
-from calibrate.kinematics import forward
 from recordings.geometry import Array
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.arms.kinematics import forward
 from calibrate.boards.model import board_points
-from calibrate.kinematics import forward
-from calibrate.projection import camera_matrix, project
+from calibrate.views.projection import camera_matrix, project
 from recordings.geometry import Array, pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.collision import ARM_BODIES, body_segments, segment_distance

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from calibrate.kinematics import forward
+from calibrate.arms.kinematics import forward
 from recordings.errors import RecordingError
 from recordings.files import require_free_space
 from recordings.geometry import difference

@@ -12,7 +12,7 @@ from collections.abc import Coroutine, Iterator
 
 import numpy as np
 
-from calibrate.kinematics import JOINT_NAMES
+from calibrate.arms.kinematics import JOINT_NAMES
 from recordings.schema.messages import Vector6
 from station.cell.arm_acceptance import STOP_GIVEN, STOP_TESTED, StopTestMove, StopWay
 from station.cell.config import vector6

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from calibrate.arms.kinematics import MODELS, forward
 from calibrate.boards.model import board_points
-from calibrate.kinematics import MODELS, forward
 from recordings.geometry import Array, inverse, pose, project_to_rotation, rotation_exp
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
 from station.cell.config import (

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.boards.printing import draw_pattern, origin_mm
-from calibrate.projection import camera_matrix, undistort
+from calibrate.views.projection import camera_matrix, undistort
 from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.simulation.truth import Light as Light

@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 from benchmarks.scene import HIGH as HIGH
 from benchmarks.scene import LOW as LOW
 from benchmarks.scene import MID, PAPER_CAMERA, SceneCell, make_cell, random_rotation
+from calibrate.arms.kinematics import RobotModel, inverse_many
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solution import Solution, SolveOptions
-from calibrate.kinematics import RobotModel, inverse_many
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project
-from calibrate.views import BoardView, ViewSet, implied_flange
+from calibrate.views.projection import project
+from calibrate.views.view_set import BoardView, ViewSet, implied_flange
 from recordings.geometry import Array, difference, perturb, pose
 from recordings.schema.messages import CameraModel, Mount
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project
-from calibrate.views import BoardView, ViewSet
+from calibrate.views.projection import project
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from recordings.schema.messages import CameraModel, Mount
 

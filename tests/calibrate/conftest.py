@@ -10,7 +10,7 @@ import pytest
 
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
-from calibrate.job import SolvedRecording, solve_recording
+from calibrate.pipeline.job import SolvedRecording, solve_recording
 from tests.calibrate.sessions import Scene, shifted, write_session
 
 

@@ -9,9 +9,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from calibrate.arm_table import FramePose
 from calibrate.boards.model import board_points
 from calibrate.files.calibration import Calibration
+from calibrate.handeye.arm_table import FramePose
 from recordings.geometry import Array, Transform, inverse, perturb, pose, rotation_exp
 from recordings.schema.messages import (
     BoardKind,

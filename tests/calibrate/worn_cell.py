@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.imperfect_cells import Imperfection, Known, imperfect_cell
 from benchmarks.scene import LOW
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array
 
 

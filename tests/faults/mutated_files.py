@@ -31,7 +31,7 @@ import recordings
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.imported import Given, believe
-from calibrate.job import solve_recording
+from calibrate.pipeline.job import solve_recording
 from recordings.errors import CodedError
 from recordings.image_headers import IMAGE_LIMIT_BYTES, ImageError, read_header
 from recordings.images import decode_image

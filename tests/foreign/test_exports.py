@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import yaml
 
-from calibrate.arm_table import FramePose
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports import export
+from calibrate.handeye.arm_table import FramePose
 from recordings.geometry import Array, Transform, pose, rotation_exp
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.simulation.cells import make_cell

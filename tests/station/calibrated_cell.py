@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.arm_table import FramePose
 from calibrate.boards.model import board_points
 from calibrate.files.calibration import FORMAT, Calibration, Lens, Provenance, Quality, Sigma, Views
-from calibrate.projection import project_at
+from calibrate.handeye.arm_table import FramePose
 from calibrate.results import Certificate
-from calibrate.views import BoardView
+from calibrate.views.projection import project_at
+from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, Transform, inverse, perturb
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig

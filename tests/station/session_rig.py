@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from calibrate.arms.kinematics import MODELS, forward
 from calibrate.boards.model import board_points
-from calibrate.kinematics import MODELS, forward
 from recordings.geometry import rotation_log
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import (

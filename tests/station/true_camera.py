@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.projection import project
-from calibrate.views import board_in_camera
+from calibrate.views.projection import project
+from calibrate.views.view_set import board_in_camera
 from recordings.geometry import Array, transform_points
 from station.simulation.truth import CellTruth
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from calibrate.arms.kinematics import MODELS
 from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.formatting import SOURCE_STAMPS
 from calibrate.files.validity import Validity, validity_text
-from calibrate.kinematics import MODELS
 from recordings.files import MAIN_CAMERA
 from recordings.geometry import Array, inverse, pose
 from recordings.importers.frames import FrameTree

@@ -10,13 +10,13 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from calibrate.arm_table import CorrectedArm
+from calibrate.arms.kinematics import URDF_LINKS, URDF_ORIGIN, DhTable, link_frames
 from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports.formats import export_format
 from calibrate.files.exports.frames import BODY_FROM_OPTICAL, FrameNames, comment
 from calibrate.files.integrity import content_sha256
-from calibrate.kinematics import URDF_LINKS, URDF_ORIGIN, DhTable, link_frames
+from calibrate.handeye.arm_table import CorrectedArm
 from recordings.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
 
 

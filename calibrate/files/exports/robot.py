@@ -16,12 +16,12 @@ from xml.parsers import expat
 
 import numpy as np
 
-from calibrate.arm_table import CorrectedArm
-from calibrate.chain import Chain
+from calibrate.arms.chain import Chain
 from calibrate.errors import UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports.frames import FrameNames, comment
 from calibrate.files.exports.models import camera, commented, numbers, table_of
+from calibrate.handeye.arm_table import CorrectedArm
 from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.pairs import all_pairs
 from calibrate.handeye.metrics import mean_pose

@@ -7,7 +7,7 @@ import numpy as np
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports.formats import export_format
 from calibrate.files.exports.frames import FrameNames, comment, commented_yaml
-from calibrate.projection import camera_matrix, distortion
+from calibrate.views.projection import camera_matrix, distortion
 from recordings.geometry import Array, quaternion_from_matrix
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
-from calibrate.kinematics import MODELS
+from calibrate.arms.kinematics import MODELS
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
 from station.devices.ur.dashboard import STOP, STOPPED

@@ -15,7 +15,7 @@ from typing import Protocol
 
 import msgspec
 
-from calibrate.kinematics import MODELS
+from calibrate.arms.kinematics import MODELS
 from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState
 from station.cell.clock_fit import ClockFit
 from station.cell.config import RobotConfig

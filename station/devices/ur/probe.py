@@ -8,7 +8,7 @@ import re
 import socket
 from dataclasses import dataclass
 
-from calibrate.kinematics import MODELS
+from calibrate.arms.kinematics import MODELS
 from station.cell.errors import RobotError
 from station.devices.rtde import PORT as RTDE_PORT
 from station.devices.rtde import RtdeError, RtdeLink

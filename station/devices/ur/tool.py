@@ -23,7 +23,7 @@ from typing import Literal
 
 import numpy as np
 
-from calibrate.kinematics import RobotModel, forward
+from calibrate.arms.kinematics import RobotModel, forward
 from recordings.geometry import Array, difference, inverse, pose_from_vector, vector_from_pose
 from recordings.schema.messages import ArmKinematics, RobotState, Vector6
 from station.cell.config import vector6

@@ -1,6 +1,6 @@
 """The simulated arm's own kinematics in plain scalars: fast enough for 500 Hz, and independent.
 
-`calibrate.kinematics` is deliberately not used: the station compares the controller's flange pose with
+`calibrate.arms.kinematics` is deliberately not used: the station compares the controller's flange pose with
 its own, and shared code would let a shared sign error cancel. A rigid transform here is a 12-tuple,
 the rows of its upper 3×4 block. Standard Denavit-Hartenberg parameters as published by Universal Robots,
 "DH parameters for calculations of kinematics and dynamics". Metres and radians. The table

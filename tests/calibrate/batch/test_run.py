@@ -16,10 +16,10 @@ import pytest
 from calibrate.batch import run
 from calibrate.batch.run import RESULTS, BatchResult, batch_key, run_batch
 from calibrate.batch.workers import Lost, R, T, pool
-from calibrate.document import _source_sha256
 from calibrate.files.lines import read_lines
-from calibrate.job import JobOptions
-from calibrate.resource_limits import Limits
+from calibrate.pipeline.document import _source_sha256
+from calibrate.pipeline.job import JobOptions
+from calibrate.pipeline.resource_limits import Limits
 from tests.patience import PATIENCE_S, wait_until
 
 

@@ -17,7 +17,7 @@ from calibrate.boards.model import (
     fixes_a_plane,
     looks_same_turns,
 )
-from calibrate.projection import project_at
+from calibrate.views.projection import project_at
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.simulation.renderer import Light, render
 from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking

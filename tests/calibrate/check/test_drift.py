@@ -24,10 +24,10 @@ from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import solve_views
-from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import intrinsics_vector, project_at, with_intrinsics_vector
-from calibrate.views import BoardView, ViewSet, extent_of
+from calibrate.pipeline.job import SolvedRecording
+from calibrate.views.projection import intrinsics_vector, project_at, with_intrinsics_vector
+from calibrate.views.view_set import BoardView, ViewSet, extent_of
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from tests.calibrate.cells import MOUNTS, QUICK, changed

@@ -23,7 +23,7 @@ from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import inverse, perturb, pose, quaternion_from_matrix, rotation_exp
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.simulation.renderer import render

@@ -11,13 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scene import random_rotation
-from calibrate.arm_table import CorrectedArm, FramePose
-from calibrate.chain import Chain, learn_chain
+from calibrate.arms.chain import Chain, learn_chain
 from calibrate.errors import BadViewsError, CalibrationFileError, UsageError
 from calibrate.files import exports
 from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration
 from calibrate.files.exports import FrameNames
-from calibrate.job import SolvedRecording
+from calibrate.handeye.arm_table import CorrectedArm, FramePose
+from calibrate.pipeline.job import SolvedRecording
 from recordings.geometry import Array, Transform, inverse, pose, rotation_exp
 from tests.calibrate.chains import ROWS, DhArm
 from tests.calibrate.files.test_exports import calibration as calibration

@@ -18,7 +18,7 @@ from calibrate.files.calibration import (
     write_calibration,
 )
 from calibrate.files.install import install, installed_calibration
-from calibrate.job import SolvedRecording, solve_recording
+from calibrate.pipeline.job import SolvedRecording, solve_recording
 from recordings.plain_text import DEVICE_TEXT_LIMIT, device_text
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraIdentity, RobotIdentity

@@ -15,16 +15,16 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from calibrate.arm_table import CorrectedArm, FramePose
-from calibrate.chain import chain_of
+from calibrate.arms.chain import chain_of
+from calibrate.arms.kinematics import MODELS, DhTable, RobotModel, forward, table_of_axes, with_near_axes
 from calibrate.errors import CalibrationError, InstallError, UsageError
 from calibrate.files import exports
 from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
-from calibrate.job import SolvedRecording
-from calibrate.kinematics import MODELS, DhTable, RobotModel, forward, table_of_axes, with_near_axes
-from calibrate.recorded_views import arm_of_ros
+from calibrate.handeye.arm_table import CorrectedArm, FramePose
+from calibrate.pipeline.job import SolvedRecording
+from calibrate.pipeline.recorded_views import arm_of_ros
 from recordings.geometry import Array, FrameMismatchError, Transform, inverse, pose, rotation_exp
 from recordings.schema.messages import RobotIdentity
 from tests.codes import raises

@@ -32,7 +32,7 @@ from calibrate.files.install import (
 from calibrate.files.loader import load_installed
 from calibrate.files.touch import Touch
 from calibrate.files.versions import installed_versions, note_installed, read_log
-from calibrate.job import SolvedRecording
+from calibrate.pipeline.job import SolvedRecording
 from calibrate.results import Gate
 from tests.codes import raises
 from tests.command_line import call

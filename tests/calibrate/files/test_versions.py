@@ -16,7 +16,7 @@ from calibrate.files import versions as module
 from calibrate.files.calibration import read_calibration
 from calibrate.files.install import change_text, install, installed_calibration, rollback
 from calibrate.files.versions import installed_versions, read_log
-from calibrate.job import SolvedRecording
+from calibrate.pipeline.job import SolvedRecording
 from recordings.files import write_atomically
 from tests.calibrate.sessions import shifted
 from tests.codes import raises

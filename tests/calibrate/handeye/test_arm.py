@@ -14,7 +14,7 @@ from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.estimate import Estimate, MixtureParts
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import solve_views
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, difference, inverse, pose, rotation_exp
 from recordings.schema.messages import Mount
 from tests.calibrate.cells import LOW, MOUNTS, QUICK, changed, error_mm_deg, inside, with_flange

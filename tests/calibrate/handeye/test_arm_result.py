@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.scene import random_rotation
-from calibrate.arm_table import CorrectedArm
-from calibrate.chain import chain_of
+from calibrate.arms.chain import chain_of
+from calibrate.arms.kinematics import MODELS, forward, with_near_axes
+from calibrate.handeye.arm_table import CorrectedArm
 from calibrate.handeye.solution import Solution, UncorrectedArm
 from calibrate.handeye.solve import solve_views
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.handeye.workspace import Workspace, sample_workspace
-from calibrate.kinematics import MODELS, forward, with_near_axes
-from calibrate.solved import Solved
+from calibrate.pipeline.solved import Solved
 from recordings.geometry import Array, difference, inverse, perturb, pose
 from tests.calibrate.cells import MOUNTS, QUICK
 from tests.calibrate.worn_cell import Worn, worn_cell

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from calibrate.gates import judge
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import solve_views
+from calibrate.pipeline.gates import judge
 from recordings.geometry import pose, rotation_exp, transform_points
 from tests.calibrate.cells import MID, MOUNTS, QUICK, changed, inside, make_cell, slipped
 

@@ -10,7 +10,7 @@ from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.solve import solve_views
-from calibrate.projection import intrinsics_vector
+from calibrate.views.projection import intrinsics_vector
 from recordings.geometry import difference
 from tests.calibrate.cells import (
     LENSES,

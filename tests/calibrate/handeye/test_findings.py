@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.gates import judge
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import solve_views
+from calibrate.pipeline.gates import judge
 from tests.calibrate.cells import (
     LENSES,
     LOW,

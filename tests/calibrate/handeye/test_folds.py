@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.gates import judge
 from calibrate.handeye import diagnosis
 from calibrate.handeye import solve as profile_robust
 from calibrate.handeye.cell_fit import fit_cell
@@ -14,6 +13,7 @@ from calibrate.handeye.estimate import estimate
 from calibrate.handeye.metrics import HELD_OUT
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.pipeline.gates import judge
 from recordings.geometry import perturb
 from tests.calibrate.cells import LOW, MID, MOUNTS, make_cell, nudged
 

@@ -10,7 +10,7 @@ from calibrate.handeye.linear import Linear
 from calibrate.handeye.noise_scales import MeasurementNoise, Scales
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.reprojection import corner_residuals
-from calibrate.views import observe_views
+from calibrate.views.view_set import observe_views
 from recordings.geometry import perturb
 from tests.calibrate.cells import LENSES, MID, MOUNTS, changed, make_cell, real_cell
 

@@ -6,12 +6,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibrate.errors import PosesDisagreeError
-from calibrate.gates import judge
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import solve_views
-from calibrate.projection import project
+from calibrate.pipeline.gates import judge
+from calibrate.views.projection import project
 from recordings.geometry import (
     inverse,
     matrix_from_quaternion,

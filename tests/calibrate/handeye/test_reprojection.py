@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.handeye.reprojection import bent_points, corner_residuals, linearise_corners
-from calibrate.projection import intrinsics_vector, with_intrinsics_vector
-from calibrate.views import observe_views
+from calibrate.views.projection import intrinsics_vector, with_intrinsics_vector
+from calibrate.views.view_set import observe_views
 from recordings.geometry import perturb
 from tests.calibrate.cells import LENSES, changed, printed, real_cell
 

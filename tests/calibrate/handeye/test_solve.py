@@ -18,7 +18,7 @@ from calibrate.errors import (
 )
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solve import SolveOptions, solve_views
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp
 from tests.calibrate.cells import LOW, MID, MOUNTS, QUICK, changed, error_mm_deg, exact_motions, make_cell
 from tests.codes import raises

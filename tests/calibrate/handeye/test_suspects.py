@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from calibrate.gates import judge
 from calibrate.handeye.metrics import distance_in_sigmas
 from calibrate.handeye.solve import solve_views
+from calibrate.pipeline.gates import judge
 from tests.calibrate.cells import (
     LOW,
     MID,

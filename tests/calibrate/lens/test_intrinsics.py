@@ -10,8 +10,8 @@ import pytest
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
-from calibrate.projection import project_at, undistort
-from calibrate.views import BoardView, ViewSet
+from calibrate.views.projection import project_at, undistort
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, pose, rotation_exp
 from recordings.schema.messages import CameraModel
 from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from benchmarks.scene import random_rotation
 from calibrate.boards.model import board_from_turned, board_points
 from calibrate.lens.pnp import candidate_poses, choose_candidates, solve_pnp
-from calibrate.projection import project
-from calibrate.views import BoardView, ViewSet
+from calibrate.views.projection import project
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_angle, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from tests.calibrate.sessions import looking

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.views import implied_flange
+from calibrate.views.view_set import implied_flange
 from recordings.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from recordings.schema.messages import CameraModel, Mount
 from station.analysis.guidance import NextView, next_view, rim, way_to

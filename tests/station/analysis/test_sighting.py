@@ -10,7 +10,7 @@ import pytest
 import recordings
 from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
-from calibrate.projection import project
+from calibrate.views.projection import project
 from recordings.geometry import transform_points
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel

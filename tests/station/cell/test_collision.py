@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from calibrate.kinematics import MODELS, forward, link_frames
+from calibrate.arms.kinematics import MODELS, forward, link_frames
 from station.cell.collision import (
     ARM_BODIES,
     CellGeometry,

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.kinematics import MODELS, forward
+from calibrate.arms.kinematics import MODELS, forward
 from recordings.geometry import rotation_exp
 from station.cell.collision import SPACING_M, CellGeometry, margins, moving_points, plate
 from station.cell.config import SPEED_CAP_M_S, Capsule, LimitsConfig, Plane

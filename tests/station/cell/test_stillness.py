@@ -8,7 +8,7 @@ import math
 import msgspec
 import pytest
 
-from calibrate.kinematics import MODELS, forward
+from calibrate.arms.kinematics import MODELS, forward
 from recordings.geometry import vector_from_pose
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.config import StillnessConfig, vector6

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibrate.kinematics import MODELS
+from calibrate.arms.kinematics import MODELS
 from station.cell.collision import ARM_BODIES, CellGeometry, body_segments
 from station.cell.config import SPEED_CAP_M_S, Capsule, LimitsConfig
 from station.cell.limits import check_plan, point_speed_m_s

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.kinematics import MODELS, forward
+from calibrate.arms.kinematics import MODELS, forward
 from recordings.geometry import difference, pose_from_rotvec
 from recordings.images import encode_png
 from recordings.schema.messages import (

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.kinematics import MODELS, RobotModel, forward
+from calibrate.arms.kinematics import MODELS, RobotModel, forward
 from recordings.geometry import pose_from_rotvec, rotation_log
 from recordings.schema.messages import RobotState, Vector6
 from station.cell.config import RobotConfig

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibrate.arms.kinematics import MODELS, forward
 from calibrate.boards.model import board_points
-from calibrate.kinematics import MODELS, forward
-from calibrate.views import implied_flange
+from calibrate.views.view_set import implied_flange
 from recordings.geometry import Array, pose, rotation_exp, transform_points
 from recordings.schema.messages import RobotIdentity
 from station.analysis.worker import CapturedView

@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.arms.kinematics import MODELS, forward
 from calibrate.boards.model import board_points
 from calibrate.check.board_now import locate_board, offset_covariance
 from calibrate.files.calibration import write_calibration
 from calibrate.files.versions import note_in_file
-from calibrate.kinematics import MODELS, forward
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig, matrix4

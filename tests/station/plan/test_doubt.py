@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.kinematics import forward
+from calibrate.arms.kinematics import forward
 from recordings.geometry import perturb
 from station.cell.collision import margins
 from station.cell.layout import cell_geometry, guess_from, layout_of

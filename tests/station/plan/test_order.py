@@ -7,7 +7,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from calibrate.kinematics import MODELS, forward
+from calibrate.arms.kinematics import MODELS, forward
 from station.cell.collision import CellGeometry
 from station.cell.config import Capsule, LimitsConfig, Plane
 from station.cell.limits import check_path

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from calibrate.kinematics import MODELS, forward
+from calibrate.arms.kinematics import MODELS, forward
 from station.cell.collision import CellGeometry
 from station.cell.config import LimitsConfig
 from station.cell.errors import ConfigError

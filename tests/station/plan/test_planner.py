@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.arms.kinematics import MODELS, forward, inverse_many
 from calibrate.boards.model import board_points
 from calibrate.handeye.information import predicted_error_m
-from calibrate.kinematics import MODELS, forward, inverse_many
 from recordings.geometry import (
     matrix_from_quaternion,
     quaternion_from_matrix,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibrate.kinematics import MODELS, forward
+from calibrate.arms.kinematics import MODELS, forward
 from recordings.reader import open_recording
 from station.analysis.estimation import seen_before
 from station.analysis.worker import BoardDetection, sight

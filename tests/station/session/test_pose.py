@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.kinematics import MODELS, forward
+from calibrate.arms.kinematics import MODELS, forward
 from recordings.geometry import pose_from_rotvec, rotation_log
 from recordings.schema.messages import Image, RobotIdentity, RobotState, Stamps, Vector6
 from station.cell.errors import RobotError

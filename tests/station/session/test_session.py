@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.recorded_views import load_views
+from calibrate.pipeline.recorded_views import load_views
 from recordings.manifest import enter_part
 from recordings.reader import open_recording
 from recordings.schema.messages import ArmKinematics

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibrate.arms.kinematics import MODELS, forward
 from calibrate.boards.model import board_points
-from calibrate.kinematics import MODELS, forward
 from recordings.geometry import is_rigid, transform_points
 from station.cell.config import PAPER_BOARD
 from station.simulation.cells import board_centre, cell_config, make_cell

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibrate import kinematics as station
+from calibrate.arms import kinematics as station
 from recordings.geometry import pose_from_rotvec
 from station.simulation.controller.kinematics import TABLES, Rigid, forward, from_pose, to_pose
 

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibrate.kinematics import MODELS, forward
+from calibrate.arms.kinematics import MODELS, forward
 from recordings.geometry import difference
 from station.simulation.controller.arm import SimulatedArm, Trapezoid
 from station.simulation.controller.kinematics import TABLES, Vector

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.kinematics import MODELS
-from calibrate.kinematics import forward as station_forward
+from calibrate.arms.kinematics import MODELS
+from calibrate.arms.kinematics import forward as station_forward
 from recordings.geometry import perturb
 
 Q = (0.3, -1.2, 1.6, -1.0, -1.3, 0.4)

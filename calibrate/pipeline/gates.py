@@ -13,7 +13,8 @@ To add one:
   4. Here add its limit and its figure; `unit` is a key of `results.UNITS_SHOWN`. A gate without a value has
      a function of its own that `judge` calls, such as `_session_gate`. A figure passes or fails; a warning is
      a gate that passed and has a remedy, such as `_arm_gate`, with a test of its own.
-  5. In tests/calibrate/test_gates.py put a good value into the fixture `solution`, a bad one into `spoiled`.
+  5. In tests/calibrate/pipeline/test_gates.py put a good value into the fixture `solution`, a bad one into
+     `spoiled`.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import view_rms_px
-from calibrate.projection import intrinsics_names
+from calibrate.pipeline.job import SolvedRecording
+from calibrate.views.projection import intrinsics_names
 
 
 def test_figures_are_the_solutions_in_the_units_that_their_names_say(solved_real: SolvedRecording) -> None:

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.annotate import annotate
 from calibrate.cli import main
 from calibrate.files.calibration import read_calibration
+from calibrate.report.annotate import annotate
 from calibrate.results import RejectedView
 from recordings.reader import open_recording
 from tests.calibrate.sessions import shifted
@@ -18,7 +18,7 @@ from tests.codes import raises
 from tests.command_line import call
 from tests.recordings.small_recording import shown
 
-SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"
+SAMPLE = Path(__file__).parents[3] / "recordings" / "samples" / "paper-640.mcap"
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from calibrate.arms.kinematics import forward
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.job import solve_recording
-from calibrate.kinematics import forward
-from calibrate.recorded_views import arm_of_ros, load_views
+from calibrate.pipeline.job import solve_recording
+from calibrate.pipeline.recorded_views import arm_of_ros, load_views
 from calibrate.report import html
 from calibrate.report.page import report_page
 from recordings.errors import MissingSegmentError

@@ -6,33 +6,26 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibrate.blas_threads import one_blas_thread
 from calibrate.boards.detect import detect
-from calibrate.boards.model import board_points, check_board, has_markers, typed_board
+from calibrate.boards.model import board_of, board_points, has_markers
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.gates import judge
+from calibrate.handeye.blas_threads import one_blas_thread
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.imported import Given, believe, is_described
-from calibrate.job import single_threaded_opencv, with_board_poses
-from calibrate.solved import Solved
-from calibrate.views import BoardView, ViewSet, array_of, require_size
-from recordings.errors import ImportSourceError
+from calibrate.pipeline.gates import judge
+from calibrate.pipeline.job import single_threaded_opencv, with_board_poses
+from calibrate.pipeline.solved import Solved
+from calibrate.views.view_set import BoardView, ViewSet, array_of, require_size
 from recordings.files import usable_cores
 from recordings.geometry import Array
 from recordings.importers import conventions
-from recordings.importers.dataset import DATASET_FILE, read_dataset
-from recordings.importers.folder import read_image
-from recordings.importers.reader import look, read_described
-from recordings.reader import Pictures
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 
 
@@ -42,56 +35,6 @@ class SolvedPictures(Solved):
 
     without_board: dict[int, str]
     """Number of a picture without the board → reason."""
-
-
-@one_blas_thread()
-def read_folder(
-    folder: Path | str,
-    board: BoardSpec | str | None = None,
-    mount: Mount | None = None,
-    convention: str | None = None,
-    poses: Path | str | None = None,
-    images: str | None = None,
-) -> Pictures:
-    """Read a folder of images and robot poses as `recordings import` does; nothing is written.
-
-    What is not given is found: board and mount by dataset.yaml, images or names, the convention of the
-    numbers and the square by the board's motion. poses: their file or folder, where others may be meant.
-    images: those of one camera or session: their folder, or their name with # for digits. Where several sets
-    fit and none is named, SeveralReadingsError holds the choices.
-    Raises RecordingError, which names what decides.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise ImportSourceError("no-folder", path=folder)
-    if is_described(folder, board, mount, convention, poses, images):
-        described = read_described(folder)
-        known, rows = described.dataset, described.rows
-    else:
-        told = read_dataset(folder / DATASET_FILE)[0] if (folder / DATASET_FILE).is_file() else None
-        given = Given(convention, mount, None if board is None else _board(board), images)
-        believed = believe(look(folder, None if poses is None else Path(poses)), given, told)
-        known, rows = believed.dataset, believed.rows
-    if any(row.camera_from_board is not None for row in rows):
-        raise ImportSourceError("pairs-only", path=folder)
-    if (camera := known.camera) is None:
-        raise ImportSourceError("dataset-value", path=folder / DATASET_FILE, key="camera")
-    joints = [row.joints_rad for row in rows]
-    return Pictures(
-        [read_image(folder, row, (camera.width, camera.height))[2] for row in rows],
-        np.array([row.base_from_flange for row in rows]),
-        known.board,
-        known.mount,
-        None if camera.matrix is None else camera,
-        None if None in joints else np.array(joints),
-        known.robot if isinstance(known.robot, str) else known.robot.model,
-    )
-
-
-def _board(given: BoardSpec | str) -> BoardSpec:
-    board = typed_board(given) if isinstance(given, str) else given
-    check_board(board)
-    return board
 
 
 class _Seen(NamedTuple):
@@ -142,7 +85,7 @@ def solve(
     teach the arm's errors; so does a `robot_model` of Universal Robots, such as "UR10e".
     Raises CalibrationError, and RecordingError for an unknown convention.
     """
-    board = _board(board)
+    board = board_of(board)
     if convention is not None:
         rows, how = array_of(poses, (len(images), -1), "poses"), conventions.convention(convention)
         try:

@@ -18,22 +18,22 @@ import cv2
 import msgspec
 import numpy as np
 
-from calibrate.blas_threads import one_blas_thread
 from calibrate.boards.model import check_board, has_markers
-from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError, require_choice
 from calibrate.files.calibration import Calibration
-from calibrate.gates import GateLimits, judge
+from calibrate.handeye.blas_threads import one_blas_thread
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance, LensPrior
 from calibrate.handeye.solution import Profile, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
-from calibrate.projection import intrinsics_names
-from calibrate.recorded_views import LoadedViews, Progress, load_views
-from calibrate.solved import Solved
-from calibrate.views import ViewSet
+from calibrate.pipeline.document import make_calibration
+from calibrate.pipeline.gates import GateLimits, judge
+from calibrate.pipeline.recorded_views import LoadedViews, Progress, load_views
+from calibrate.pipeline.solved import Solved
+from calibrate.views.projection import intrinsics_names
+from calibrate.views.view_set import ViewSet
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from calibrate.errors import CalibrationError
-from calibrate.resource_limits import Limits, SolveLimitError, bounded
+from calibrate.pipeline.resource_limits import Limits, SolveLimitError, bounded
 from tests.codes import raises
 from tests.patience import PATIENCE_S
 

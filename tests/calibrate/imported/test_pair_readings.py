@@ -21,7 +21,7 @@ from calibrate.handeye.board_motion import boards_own_motion
 from calibrate.handeye.solve import solve_views
 from calibrate.imported import Believed, Given, believe, is_described
 from calibrate.imported.directions import Told, directions, unit_named
-from calibrate.views import NO_CORNERS, BoardView, ViewSet
+from calibrate.views.view_set import NO_CORNERS, BoardView, ViewSet
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
 from recordings.geometry import inverse, pose

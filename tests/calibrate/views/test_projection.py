@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.projection import project
+from calibrate.views.projection import project
 from tests.calibrate.cells import LENSES
 
 POINTS = np.random.default_rng(0).normal(size=(30, 3)) * [0.2, 0.2, 0.1] + [0, 0, 1.0]

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.arm_table import FramePose
 from calibrate.boards.model import ambiguity_text
 from calibrate.files.calibration import (
     FORMAT,
@@ -26,13 +25,14 @@ from calibrate.files.calibration import (
     ViewWeight,
 )
 from calibrate.files.validity import time_text
+from calibrate.handeye.arm_table import FramePose
 from calibrate.handeye.solution import Solution
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
-from calibrate.projection import intrinsics_names
-from calibrate.recorded_views import LoadedViews
+from calibrate.pipeline.recorded_views import LoadedViews
 from calibrate.results import Gate, Remark
-from calibrate.views import ViewSet
+from calibrate.views.projection import intrinsics_names
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Transform
 from recordings.plain_text import plain_text
 from recordings.reader import Recording
@@ -104,7 +104,7 @@ def solver_software() -> dict[str, str]:
 @cache
 def _source_sha256() -> str:
     """Hash the modules that make a result: in a checkout they change without the version."""
-    digest, root = hashlib.sha256(), Path(__file__).parents[1]
+    digest, root = hashlib.sha256(), Path(__file__).parents[2]
     for path in sorted(root.glob("calibrate/**/*.py")) + sorted(root.glob("recordings/**/*.py")):
         digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
     return digest.hexdigest()

@@ -17,7 +17,7 @@ from calibrate.errors import BadViewsError
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
-from calibrate.job import (
+from calibrate.pipeline.job import (
     JobOptions,
     SolvedRecording,
     prepare_views,
@@ -25,7 +25,7 @@ from calibrate.job import (
     solver_options,
     with_board_poses,
 )
-from calibrate.views import ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import difference
 from recordings.importers.folder import import_folder
 from recordings.schema.messages import CameraModel

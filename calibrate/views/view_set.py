@@ -9,8 +9,8 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibrate.arms.kinematics import RobotModel
 from calibrate.errors import BadViewsError, require_choice
-from calibrate.kinematics import RobotModel
 from recordings.geometry import Array, inverse
 from recordings.schema.messages import CameraModel, Mount
 

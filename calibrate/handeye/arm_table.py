@@ -12,11 +12,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibrate.chain import Chain, chain_of
+from calibrate.arms.chain import Chain, LearnedArm, chain_of
+from calibrate.arms.kinematics import DhTable
 from calibrate.errors import CalibrationFileError
-from calibrate.kinematics import DhTable
-from calibrate.results import LearnedArm
-from calibrate.views import array_of
+from calibrate.views.view_set import array_of
 from recordings.geometry import Array, Transform
 from recordings.schema.messages import Matrix4
 

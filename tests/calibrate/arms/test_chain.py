@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from calibrate.chain import learn_chain, read_otherwise, wrong_row
+from calibrate.arms.chain import learn_chain, read_otherwise, wrong_row
 from recordings.geometry import Array, difference, pose, rotation_exp
 from tests.calibrate.chains import ROWS, DhArm
 

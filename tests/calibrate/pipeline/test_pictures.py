@@ -15,9 +15,9 @@ import recordings
 from calibrate.boards.detect import detect
 from calibrate.errors import CalibrationError
 from calibrate.handeye import BoardTolerance, SolveOptions
-from calibrate.job import SolvedRecording
-from calibrate.pictures import read_folder
-from calibrate.views import ViewSet
+from calibrate.pipeline.job import SolvedRecording
+from calibrate.pipeline.pictures import read_folder
+from calibrate.views.view_set import ViewSet
 from recordings.exporters.export import export_recording
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel
@@ -88,8 +88,10 @@ def test_the_tolerance_of_a_board_that_states_none_is_the_one_asked_for(
     given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[SolveOptions] = []
-    monkeypatch.setattr("calibrate.pictures.solve_views", lambda views, options: told.append(options))
-    monkeypatch.setattr("calibrate.pictures.judge", lambda solution: ())
+    monkeypatch.setattr(
+        "calibrate.pipeline.pictures.solve_views", lambda views, options: told.append(options)
+    )
+    monkeypatch.setattr("calibrate.pipeline.pictures.judge", lambda solution: ())
     calibrate.solve(**given, options=SolveOptions(board=BoardTolerance(square=1e-5)))
     assert told[0].board == BoardTolerance(square=1e-5)
 

@@ -12,9 +12,9 @@ import numpy as np
 from calibrate.errors import BadViewsError, require_choice
 from calibrate.handeye.reprojection import bent_points
 from calibrate.handeye.solution import Solution
-from calibrate.projection import project_at
 from calibrate.results import SHAPE, Gate
-from calibrate.views import BoardView, ViewSet, board_in_camera, observe_views
+from calibrate.views.projection import project_at
+from calibrate.views.view_set import BoardView, ViewSet, board_in_camera, observe_views
 from recordings.geometry import Array
 from recordings.schema.messages import CameraModel
 

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field, replace
 import msgspec
 import numpy as np
 
+from calibrate.arms.kinematics import MODELS, URDF_LINKS, URDF_ORIGIN, RobotModel, table_of_axes
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
-from calibrate.kinematics import MODELS, URDF_LINKS, URDF_ORIGIN, RobotModel, table_of_axes
 from calibrate.results import RejectedView
-from calibrate.views import NO_CORNERS, NOMINAL_CAMERA, BoardView, ViewSet, require_size
+from calibrate.views.view_set import NO_CORNERS, NOMINAL_CAMERA, BoardView, ViewSet, require_size
 from recordings import strict_yaml
 from recordings.errors import BadImageError
 from recordings.files import usable_cores

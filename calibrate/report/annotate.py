@@ -17,9 +17,9 @@ from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_from_turned, board_points, looks_same_turns
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, encode_calibration
-from calibrate.projection import project_at
-from calibrate.recorded_views import Progress, load_views
-from calibrate.views import board_in_camera
+from calibrate.pipeline.recorded_views import Progress, load_views
+from calibrate.views.projection import project_at
+from calibrate.views.view_set import board_in_camera
 from recordings.geometry import Array
 from recordings.reader import Recording
 from recordings.schema.messages import Image, Matrix4

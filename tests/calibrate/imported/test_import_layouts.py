@@ -47,7 +47,7 @@ SCENES = {
 """Two sessions of a camera, and another camera in the first one."""
 GIVEN = Given(mount="eye-in-hand", board=PAPER_BOARD)
 OTHER_BOARD = msgspec.structs.replace(PAPER_BOARD, columns=12, rows=11)
-FAILING = Path(__file__).parents[3] / "shared/failing"
+FAILING = Path(__file__).parents[4] / "shared/failing"
 
 
 @dataclass(frozen=True)

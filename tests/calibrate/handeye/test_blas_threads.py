@@ -13,9 +13,9 @@ import scipy.linalg  # noqa: F401 - loads a BLAS of its own
 import threadpoolctl
 
 import calibrate
-from calibrate.blas_threads import one_blas_thread
 from calibrate.errors import CalibrationError
 from calibrate.handeye import SolveOptions, ViewSet, compare_all, solve_views
+from calibrate.handeye.blas_threads import one_blas_thread
 from recordings.geometry import Array
 from tests.calibrate.cells import exact_motions, make_cell
 from tests.patience import PATIENCE_S

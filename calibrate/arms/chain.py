@@ -16,11 +16,11 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.kinematics import DhTable, link_frames
-from calibrate.results import LearnedArm
+from calibrate.arms.kinematics import DhTable, link_frames
 from recordings.geometry import (
     Array,
     difference,
@@ -31,6 +31,15 @@ from recordings.geometry import (
     rotation_log,
     skew,
 )
+
+
+class LearnedArm(msgspec.Struct, frozen=True):
+    """The arm's kinematics as they were learned: a `Chain`, metres and radians, in base."""
+
+    axes: tuple[tuple[float, ...], ...]
+    points: tuple[tuple[float, ...], ...]
+    posture_rad: tuple[float, ...]
+    flange: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)

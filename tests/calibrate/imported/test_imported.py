@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from benchmarks.misread_poses import MISREAD, said
+from calibrate.arms.kinematics import MODELS
 from calibrate.files import exports
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
 from calibrate.imported import Given, believe, board
-from calibrate.job import JobOptions, solve_recording
-from calibrate.kinematics import MODELS
 from calibrate.lens.pnp import Candidate
+from calibrate.pipeline.job import JobOptions, solve_recording
 from calibrate.report.page import report_page
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
@@ -353,7 +353,7 @@ def test_circles_that_nobody_described_are_found(tmp_path: Path) -> None:
     assert (seen.board.kind, seen.board.columns, seen.board.rows) == (circles.kind, 4, 7)
 
 
-MOVEIT = Path(__file__).parents[3] / "shared/datasets/pose-pairs/moveit50.csv"
+MOVEIT = Path(__file__).parents[4] / "shared/datasets/pose-pairs/moveit50.csv"
 
 
 @pytest.mark.parametrize("write", PAIRS)

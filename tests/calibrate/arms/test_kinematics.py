@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, jacobian, singularity_measure
+from calibrate.arms.kinematics import MODELS, RobotModel, forward, inverse_many, jacobian, singularity_measure
 from recordings.geometry import Array, rotation_log, skew
 
 UR10 = MODELS["UR10"]

@@ -12,10 +12,10 @@ import pytest
 from calibrate.cli.inputs import read_limits
 from calibrate.errors import UsageError
 from calibrate.files.formatting import figures
-from calibrate.gates import GateLimits, judge
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solution import Explanation, Finding, Reading, Solution
-from calibrate.job import SolvedRecording
+from calibrate.pipeline.gates import GateLimits, judge
+from calibrate.pipeline.job import SolvedRecording
 from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark
 from tests.codes import raises
 

@@ -8,8 +8,8 @@ import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.imported.scenery import mount_by_scene
-from calibrate.projection import project_at
-from calibrate.views import BoardView
+from calibrate.views.projection import project_at
+from calibrate.views.view_set import BoardView
 from recordings.geometry import pose
 from recordings.schema.messages import CameraModel, Mount
 from tests.calibrate.sessions import PAPER_BOARD, looking

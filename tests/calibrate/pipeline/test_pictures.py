@@ -15,8 +15,8 @@ import recordings
 from calibrate.boards.detect import detect
 from calibrate.errors import CalibrationError
 from calibrate.handeye import BoardTolerance, SolveOptions
+from calibrate.imported.read_folder import read_folder
 from calibrate.pipeline.job import SolvedRecording
-from calibrate.pipeline.pictures import read_folder
 from calibrate.views.view_set import ViewSet
 from recordings.exporters.export import export_recording
 from recordings.reader import open_recording

@@ -123,7 +123,8 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
         if not any(each.often and (each.known or each.board.kind is BoardKind.CHESSBOARD) for each in likely):
             likely += _likely(_shown_circles(greys), few, progress)
     for each in sorted(likely, key=_Tried.rank)[:2]:
-        board, known = each.board, each.known
+        board = each.board
+        known = each.known
         points = board_points(board)
         found = dict(_search(small, board, known, progress))
         views: dict[Key, BoardView] = {

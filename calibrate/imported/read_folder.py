@@ -39,12 +39,14 @@ def read_folder(
         raise ImportSourceError("no-folder", path=folder)
     if is_described(folder, board, mount, convention, poses, images):
         described = read_described(folder)
-        known, rows = described.dataset, described.rows
+        known = described.dataset
+        rows = described.rows
     else:
         told = read_dataset(folder / DATASET_FILE)[0] if (folder / DATASET_FILE).is_file() else None
         given = Given(convention, mount, None if board is None else board_of(board), images)
         believed = believe(look(folder, None if poses is None else Path(poses)), given, told)
-        known, rows = believed.dataset, believed.rows
+        known = believed.dataset
+        rows = believed.rows
     if any(row.camera_from_board is not None for row in rows):
         raise ImportSourceError("pairs-only", path=folder)
     if (camera := known.camera) is None:

@@ -152,7 +152,8 @@ class _Link:
             a, b = self.table[after - 1], self.table[after].copy()
             b[:, 3:] *= np.where((a[:, 3:] * b[:, 3:]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
             row = (1 - share) * a + share * b
-        position, R = row[:, :3], matrix_from_quaternion(row[:, 3:])
+        position = row[:, :3]
+        R = matrix_from_quaternion(row[:, 3:])
         if self.forward:
             return position, R
         R = np.swapaxes(R, 1, 2)

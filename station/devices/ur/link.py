@@ -138,7 +138,8 @@ class UrLink:
         )
 
     def _check_identity(self, found: Found) -> None:
-        wanted, host = self.config, self.config.host
+        wanted = self.config
+        host = self.config.host
         if found.model and found.model not in MODELS:
             raise unsupported_model(found.model, host)
         if found.model and found.model != wanted.model:
@@ -170,7 +171,8 @@ class UrLink:
     async def _close_link(self) -> None:
         self.states.close()
         await self.tool.close()
-        dashboard, self.dashboard = self.dashboard, None
+        dashboard = self.dashboard
+        self.dashboard = None
         if dashboard is not None:
             await dashboard.close()
 

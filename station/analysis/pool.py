@@ -65,16 +65,23 @@ class Workers:
             self.waiting -= 1
 
     async def _ask(self, pool: ProcessPoolExecutor, timeout_s: float, work: partial[R]) -> R:
+        died = WorkerError("worker-died", function=work.func.__name__)
+        if self._pool is not pool:  # it was closed while the process started
+            raise died
         try:
             async with asyncio.timeout(timeout_s):
                 return await asyncio.wrap_future(pool.submit(work))
-        except asyncio.CancelledError:  # its work would go on, and count as time of the next call
+        except asyncio.CancelledError as cancelled:
+            self._discard(pool)  # its work would go on, and count as time of the next call
+            if _is_being_cancelled():
+                raise
+            raise died from cancelled  # by the pool, which was closed before it began this work
+        except TimeoutError as late:
             self._discard(pool)
-            raise
-        except (BrokenProcessPool, TimeoutError) as error:
+            raise WorkerError("worker-late", function=work.func.__name__) from late
+        except BrokenProcessPool as broken:
             self._discard(pool)
-            code = "worker-late" if isinstance(error, TimeoutError) else "worker-died"
-            raise WorkerError(code, function=work.func.__name__) from error
+            raise died from broken
 
     def close(self) -> None:
         self._closed = True
@@ -92,6 +99,12 @@ class Workers:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.kill()
+
+
+def _is_being_cancelled() -> bool:
+    """Tell whether somebody cancelled the task that runs now."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 def live_with_parent() -> None:

@@ -1,0 +1,87 @@
+"""A caller of a worker process learns of its end, and is cancelled only when somebody cancels the caller."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from concurrent.futures import Future
+
+import pytest
+
+from station.analysis import pool
+from station.analysis.pool import Workers
+from tests.codes import raises
+from tests.patience import until
+
+
+def nothing() -> None:
+    """Start without any preparation."""
+
+
+class PoolThatNeverBegins:
+    """Stands for an executor whose own thread has not yet handed the work to its process."""
+
+    _processes = None
+
+    def __init__(self, *_arguments: object, **_options: object) -> None:
+        self._submitted: list[Future[object]] = []
+
+    def submit(self, _work: object) -> Future[object]:
+        future: Future[object] = Future()
+        self._submitted.append(future)
+        return future
+
+    def shutdown(self, wait: bool, cancel_futures: bool) -> None:
+        assert cancel_futures and not wait
+        for future in self._submitted:
+            future.cancel()
+
+
+async def test_a_call_that_has_not_begun_when_the_pool_closes_ends_with_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The executor cancels what it has not begun; the task that waits for it was not cancelled by anybody."""
+    monkeypatch.setattr(pool, "ProcessPoolExecutor", PoolThatNeverBegins)
+    workers = Workers(nothing)
+    waiting = asyncio.create_task(workers.call(os.getpid))
+    await asyncio.sleep(0)
+    workers.close()
+    with raises("worker-died"):
+        await waiting
+
+
+async def test_a_caller_who_is_cancelled_stays_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool, "ProcessPoolExecutor", PoolThatNeverBegins)
+    workers = Workers(nothing)
+    waiting = asyncio.create_task(workers.call(os.getpid))
+    await asyncio.sleep(0)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    workers.close()
+
+
+@pytest.mark.process
+async def test_a_call_under_way_ends_with_an_error_when_the_pool_closes() -> None:
+    workers = Workers(nothing)
+    await workers.start()
+    waiting = asyncio.create_task(workers.call(time.sleep, 600.0))
+    await until(lambda: workers.waiting)
+    workers.close()
+    with raises("worker-died"):
+        await waiting
+    with raises("station-ending"):
+        await workers.call(os.getpid)
+
+
+@pytest.mark.process
+async def test_a_call_that_is_late_is_given_up_and_the_next_one_gets_a_new_process() -> None:
+    workers = Workers(nothing)
+    try:
+        first = await workers.call(os.getpid)
+        with raises("worker-late"):
+            await workers.call(time.sleep, 600.0, timeout_s=0.01)
+        assert await workers.call(os.getpid) != first
+    finally:
+        workers.close()

@@ -54,8 +54,8 @@ def measure(task: tuple[str, Mount, float, int]) -> tuple[float, ...]:
         for views in (cell.views, arm_cell(*task, joints=False).views)
     )
     miss, plain_miss = (Miss.of(solution, cell.X) for solution in (learned, plain))
-    assert learned.arm is not None and learned.arm.uncorrected is not None
-    installed = learned.arm.uncorrected
+    assert learned.fit.arm is not None and learned.fit.arm.uncorrected is not None
+    installed = learned.fit.arm.uncorrected
     lengths_m = [miss.shift_m, learned.sigma_translation_m, plain_miss.shift_m]
     lengths_m += [over_range(cell, installed.X), installed.error_m]
     error, claimed, plain_error, over, said = (1e3 * length for length in lengths_m)

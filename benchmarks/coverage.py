@@ -115,7 +115,7 @@ def measure(task: tuple[int, Mount, int]) -> CoverageTrial:
         or miss.turn_rad > _BEYOND * solution.sigma_rotation_rad
     )
     closed = tuple(
-        f"session: {solution.session.reading.value}" if gate.name == "session" else gate.name
+        f"session: {solution.judgement.session.reading.value}" if gate.name == "session" else gate.name
         for gate in gates
         if not gate.passed
     )

@@ -71,9 +71,9 @@ def untouched(task: tuple[Mount, int]) -> list[bool]:
     """Test the newest 30 pictures after each new one; tell the alarms."""
     mount, seed = task
     cell = arm_cell("seven joints", mount, 0.2, 70_000 + seed)
-    posterior = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
-    assert posterior.posterior is not None
-    known = KnownCell.of(posterior.posterior, posterior.camera).with_board(BoardTolerance())
+    solved = solve_views(cell.views, SolveOptions(holdout=False, folds=False)).fit
+    assert solved.posterior is not None
+    known = KnownCell.of(solved.posterior, solved.camera).with_board(BoardTolerance())
     rng, four = np.random.default_rng([seed, 3]), [0, 8, 54, 62]
     pictures = []
     for k in range(EARLIER_PICTURES + NEW_PICTURES):
@@ -93,8 +93,8 @@ def measure(task: tuple[str, Mount, float, int]) -> tuple[float, ...]:
     seed = 50_000 + task[3]
     cell = arm_cell(*task[:3], seed)
     solution = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
-    assert solution.posterior is not None
-    known = KnownCell.of(solution.posterior, solution.camera)
+    assert solution.fit.posterior is not None
+    known = KnownCell.of(solution.fit.posterior, solution.fit.camera)
     way = np.random.default_rng([seed, 2]).normal(size=3)
     shift = np.r_[SHIFT_M * way / np.linalg.norm(way), np.zeros(3)]
 

@@ -100,12 +100,12 @@ def what_is_said(folder: Path, output: Path) -> Said:
     hypothesis = answer.session.hypothesis
     if hypothesis == Reading.AS_RECORDED.value:
         hypothesis = ""
-    rejected = job.solution.rejected
+    rejected = job.solution.evidence.views.rejected
     swapped = tuple(view.index for view in rejected if view.kind == "wrong-pose")
     inconsistent = tuple(view.index for view in rejected if view.kind != "wrong-pose")
     failed = [gate for gate in answer.gates if not gate.passed]
     texts = [answer.session.text, *(gate.text for gate in failed)]
-    texts += [remark.text for remark in job.solution.warnings] + [view.reason for view in rejected]
+    texts += [remark.text for remark in job.solution.judgement.warnings] + [view.reason for view in rejected]
     verdict = "fail: " + ", ".join(gate.name for gate in failed) if failed else "pass"
     text = " ".join(filter(None, texts))
     return Said(hypothesis or verdict, hypothesis, swapped, text, inconsistent=inconsistent)

@@ -71,7 +71,7 @@ def measure(task: tuple[str, float, str, bool, Mount, int]) -> MovedTrial:
     at = int(rng.integers(9, 17))
     views = moved_cell(rng, what, size_mm, order, joints, mount, at, seed)
     try:
-        session = solve_views(views, _OPTIONS).session
+        session = solve_views(views, _OPTIONS).judgement.session
     except CalibrationError as problem:
         named = problem.values.get("hypothesis") in {reading.value for reading in _CHANGES}
         return MovedTrial(named, False, False)

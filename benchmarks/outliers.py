@@ -99,7 +99,7 @@ def measure(task: tuple[str, float, Mount, int]) -> OutlierTrial:
             truly = named == spoilt.reading.value
             falsely = "hypothesis" in problem.values and not truly
             return OutlierTrial(False, named, oracle, truly, falsely)
-        reading = solution.session.reading
+        reading = solution.judgement.session.reading
     passed = all(gate.passed for gate in judge(solution))
     truly, falsely = _named(solution, spoilt, set(bad.tolist()))
     return OutlierTrial(passed, reading.value, oracle, truly, falsely, Miss.of(solution, spoilt.X))
@@ -114,12 +114,12 @@ def _bad_views(name: str, share: float, seed: int, rng: np.random.Generator) -> 
 
 def _named(solution: Solution, spoilt: Spoilt, bad: set[int]) -> tuple[bool, bool]:
     """Truly, falsely."""
-    reading = solution.session.reading
+    reading = solution.judgement.session.reading
     if spoilt.reading is not Reading.AS_RECORDED:
         return reading is spoilt.reading, reading not in (spoilt.reading, Reading.AS_RECORDED)
-    kinds = {view.index: view.kind for view in solution.rejected}
+    kinds = {view.index: view.kind for view in solution.evidence.views.rejected}
     right = {index for index, kind in kinds.items() if index in bad and kind == spoilt.kind}
-    found = set(solution.turned) if spoilt.kind == "" else right
+    found = set(solution.evidence.views.turned) if spoilt.kind == "" else right
     falsely = reading is not Reading.AS_RECORDED or bool(set(kinds) - right)
     return found == bad and not falsely, falsely
 

@@ -94,15 +94,16 @@ def _errors(views: ViewSet, board: BoardSpec | None, out: Places, rest: Places) 
         joined = solve_views(training, options)
         bare = tuple(replace(view, joints_rad=None) for view in training)
         alone = solve_views(replace(training, views=bare), options)
-        seen = views if board is None else solve_pnp(replace(views, camera=joined.camera), board)
-    assert joined.arm is not None and joined.arm.result is not None and joined.arm.uncorrected is not None
-    nominal = joined.arm.result.nominal_chain
-    errors = np.array([error.value for error in joined.arm.stated.table])[: len(nominal.link_errors)]
+        seen = views if board is None else solve_pnp(replace(views, camera=joined.fit.camera), board)
+    arm = joined.fit.arm
+    assert arm is not None and arm.result is not None and arm.uncorrected is not None
+    nominal = arm.result.nominal_chain
+    errors = np.array([error.value for error in arm.stated.table])[: len(nominal.link_errors)]
     by_joints = nominal.with_errors(errors).forward(_joints(views))
     told, corrected = (mount_poses(F, views.mount) for F in (views.base_from_flange, by_joints))
     C = seen.camera_from_board
     peers = (opencv_hand_eye(told[rest], C[rest], HAND_EYE[name]) for name in METHODS[3:])
-    ways = ((corrected, joined.matrix), (told, joined.arm.uncorrected.X), (told, alone.matrix))
+    ways = ((corrected, joined.matrix), (told, arm.uncorrected.X), (told, alone.matrix))
     for H, X in (*ways, *((told, X) for X in peers)):
         Y = mean_pose((H @ X @ C)[rest])
         by_arm, seen_from = (inverse(Y) @ H @ X)[out], inverse(C[out])  # board_from_camera

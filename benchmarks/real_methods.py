@@ -59,21 +59,21 @@ def ours(views: ViewSet, board: BoardSpec) -> Answer:
         views = solve_pnp(views, board)
         options = SolveOptions(intrinsics_from_same_pictures=free, holdout=False, folds=False)
         solution = solve_views(views, options)
-    Y = solution.board_place.matrix
+    Y = solution.fit.board_place.matrix
     shape = _shape(views, solution)
     return Answer(
         X=solution.matrix,
         centre=Y[:3, :3] @ shape(board_centre(views)[None])[0] + Y[:3, 3],
-        camera=solution.camera,
+        camera=solution.fit.camera,
         shape=shape,
         covariance=solution.covariance,
-        weights=solution.weights,
+        weights=solution.evidence.weights,
     )
 
 
 def _shape(views: ViewSet, solution: Solution) -> Callable[[Array], Array]:
     """Points of the board as stated (k, 3) to where the solution has them."""
-    found = solution.board
+    found = solution.fit.board
     if found is None:
         return _as_described
     observed = observe_views(views)

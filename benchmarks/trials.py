@@ -68,7 +68,7 @@ class Miss:
         delta = difference(solution.matrix, truth)
         square = float(delta @ np.linalg.solve(solution.covariance, delta))
         shift_m, turn_rad = (float(np.linalg.norm(part)) for part in (delta[:3], delta[3:]))
-        return cls(square, square <= solution.confidence_threshold, shift_m, turn_rad)
+        return cls(square, square <= solution.fit.confidence_threshold, shift_m, turn_rad)
 
 
 def rms(values: Array) -> float:

@@ -98,6 +98,35 @@ class RejectedView(msgspec.Struct, frozen=True, omit_defaults=True):
     """Recorded minus true of that number, metres or radians."""
 
 
+class ViewWeight(msgspec.Struct, frozen=True):
+    index: int
+    weight: float
+    """0: rejected; 1: counts fully."""
+
+
+class Views(msgspec.Struct, frozen=True):
+    """What became of the views of a recording, by their pose numbers from 0."""
+
+    used: list[int]
+    rejected: list[RejectedView] = []
+    turned: list[int] = []
+    """Views whose corner order was turned by 180° to agree with the others, and kept."""
+    weights: list[ViewWeight] = []
+    """Files of earlier versions omit views of weight 1."""
+
+
+class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
+    """How far a used view is from the model."""
+
+    index: int
+    rms_px: float | None = None
+    """Of its corners, with the board pose that fits them best; None without corners."""
+    robot_mm: float | None = None
+    """Between the recorded and the modelled flange; None for the paper profile."""
+    robot_deg: float | None = None
+    """The same of its orientation."""
+
+
 class HoldoutScore(msgspec.Struct, frozen=True, omit_defaults=True):
     """Equations 24 to 26 of the paper on pairs that took no part in the fit."""
 
@@ -145,6 +174,25 @@ class CrossValidation:
     folds: int
     limit: float = 0.0
     """Limit of `rms_mm` over `claimed_mm`; above it the stated uncertainties are too small."""
+
+
+class QualityFigures(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Figures that say how good X is: judged by gates, and written to the file as they are."""
+
+    certificate: Certificate
+    holdout: HoldoutScore | None = None
+    rms_px: float | None = None
+    """Rms of the corners against the model, with the robot's poses adjusted within their noise."""
+    board_spread_mm: float | None = None
+    """Root mean square distance of the board's origin in base (or flange), view by view, from its mean."""
+    board_spread_deg: float | None = None
+    predicted_error_mm: float | None = None
+    """1σ (root of the mean squared length) of a point at the working distance on the camera's axis, for the
+    X that is installed."""
+    working_distance_m: float | None = None
+    error_shares: dict[str, float] = {}
+    """Source of the error of X → its share of the variance."""
+    cross_validation: CrossValidation | None = None
 
 
 class ArmErrorValue(msgspec.Struct, frozen=True):

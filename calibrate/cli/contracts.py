@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from calibrate.files.calibration import Lens, SessionReading, Sigma, Views
+from calibrate.files.calibration import Lens, SessionReading, Sigma
 from calibrate.files.validity import Validity
 from calibrate.handeye.arm_table import CorrectedArm, FramePose
 from calibrate.results import (
@@ -19,6 +19,7 @@ from calibrate.results import (
     HoldoutScore,
     PeerResult,
     Remark,
+    Views,
 )
 from recordings.schema.messages import Mount
 

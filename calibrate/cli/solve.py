@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import numpy as np
 import typer
 from rich.table import Table
@@ -152,14 +151,26 @@ def _numbers(words: str) -> tuple[int, ...]:
 def solve_json(job: SolvedRecording) -> SolveJson:
     """Build the object that `calibrate solve --json` prints: the file's structs, side by side."""
     found = job.calibration
-    known = msgspec.structs.asdict(found.quality) | msgspec.structs.asdict(found)
-    known |= {
-        "board": found.quality.board,
-        "verdict": "pass" if job.passed else "fail",
-        "warnings": found.quality.remarks,
-        "solve_ms": job.solve_ms,
-    }
-    return SolveJson(**{name: known[name] for name in SolveJson.__struct_fields__})
+    quality = found.quality
+    return SolveJson(
+        mount=found.mount,
+        result=found.result,
+        sigma=found.sigma,
+        covariance=found.covariance,
+        views=found.views,
+        intrinsics=found.intrinsics,
+        holdout=quality.holdout,
+        certificate=quality.certificate,
+        gates=quality.gates,
+        verdict="pass" if job.passed else "fail",
+        warnings=quality.remarks,
+        cross_validation=quality.cross_validation,
+        board=quality.board,
+        session=quality.session,
+        arm=quality.arm,
+        arm_table=found.arm_table,
+        solve_ms=job.solve_ms,
+    )
 
 
 def _root_of(target: Path) -> Path | None:

@@ -29,13 +29,12 @@ from calibrate.handeye.arm_table import CorrectedArm, FramePose
 from calibrate.results import (
     Arm,
     BoardShape,
-    Certificate,
-    CrossValidation,
     Gate,
-    HoldoutScore,
     Posterior,
-    RejectedView,
+    QualityFigures,
     Remark,
+    ViewQuality,
+    Views,
 )
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.geometry import Transform as Transform
@@ -66,19 +65,6 @@ class Sigma(msgspec.Struct, frozen=True):
         return cls(1e3 * shift, math.degrees(turn))
 
 
-class ViewWeight(msgspec.Struct, frozen=True):
-    index: int
-    weight: float
-
-
-class Views(msgspec.Struct, frozen=True):
-    used: list[int]
-    rejected: list[RejectedView] = []
-    turned: list[int] = []
-    weights: list[ViewWeight] = []
-    """0: rejected; 1 counts fully. Files of earlier versions omit views of weight 1."""
-
-
 class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
     width: int
     height: int
@@ -97,13 +83,6 @@ class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
         )
 
 
-class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
-    index: int
-    rms_px: float | None = None
-    robot_mm: float | None = None
-    robot_deg: float | None = None
-
-
 class SessionReading(msgspec.Struct, frozen=True, omit_defaults=True):
     """Interpretation that explains the recording best: as recorded, or for instance with inverted poses."""
 
@@ -117,26 +96,19 @@ class SessionReading(msgspec.Struct, frozen=True, omit_defaults=True):
     """Indices of views between which that is, with a probability of 95 %."""
 
 
-class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
+class Quality(QualityFigures, frozen=True, omit_defaults=True, kw_only=True):
+    """The figures of a solution, the gates that judge them, and what else speaks for or against it."""
+
     gates: list[Gate]
-    certificate: Certificate
-    holdout: HoldoutScore | None = None
-    rms_px: float | None = None
-    views: list[ViewQuality] = []
-    board_spread_mm: float | None = None
-    board_spread_deg: float | None = None
-    predicted_error_mm: float | None = None
-    working_distance_m: float | None = None
-    noise: dict[str, float] = {}
+    views: list[ViewQuality] = msgspec.field(default_factory=list)
+    noise: dict[str, float] = msgspec.field(default_factory=dict)
     """corner_px, robot_mm, robot_deg"""
-    error_shares: dict[str, float] = {}
     weakest: str = ""
     board: BoardShape | None = None
-    cross_validation: CrossValidation | None = None
     session: SessionReading | None = None
     arm: Arm | None = None
-    warnings: list[str] = []
-    warning_codes: list[str] = []
+    warnings: list[str] = msgspec.field(default_factory=list)
+    warning_codes: list[str] = msgspec.field(default_factory=list)
     """Code of each of `warnings`."""
 
     @property

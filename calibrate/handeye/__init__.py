@@ -6,9 +6,10 @@
     poses = np.load("poses.npz")  # (n, 4, 4) each, n ≥ 4, tilted about two axes; metres
     views = ViewSet.from_poses("eye-in-hand", poses["base_from_flange"], poses["camera_from_board"])
     solution = solve_views(views, SolveOptions(seed=1))
-    flange_from_camera, covariance = solution.installed  # (4, 4), (6, 6)
-    print(solution.sigma_translation_m, solution.sigma_rotation_rad, solution.certificate.certified)
-    for view in solution.rejected:
+    flange_from_camera, covariance = solution.fit.installed  # (4, 4), (6, 6)
+    print(solution.sigma_translation_m, solution.sigma_rotation_rad)
+    print(solution.judgement.figures.certificate.certified)
+    for view in solution.evidence.views.rejected:
         print(view.index, view.kind, view.reason)
 
 With corners in each `BoardView` and a camera, the same call also estimates lens, board shape and arm.

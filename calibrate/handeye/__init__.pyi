@@ -5,6 +5,9 @@ from .noise_scales import MeasurementNoise as MeasurementNoise
 from .peers import PeerResult as PeerResult
 from .peers import compare_all as compare_all
 from .priors import BoardTolerance as BoardTolerance
+from .solution import Evidence as Evidence
+from .solution import FittedCell as FittedCell
+from .solution import Judgement as Judgement
 from .solution import Solution as Solution
 from .solution import SolveOptions as SolveOptions
 from .solve import BoardView as BoardView

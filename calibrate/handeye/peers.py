@@ -67,12 +67,12 @@ def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[Pee
     start = time.perf_counter()
     ours = solve_robust_profile(views, options)
     ours_ms = 1e3 * (time.perf_counter() - start)
-    kept = replace(views, views=ours.kept)
+    kept = replace(views, views=ours.evidence.kept)
     held = _held_out(kept)
     rows = [_row(name, method, kept, held, ours) for name, method in _methods(options).items()]
     final = _scored("ours", ours.matrix, kept, ours)
-    if ours.holdout is not None:
-        final = replace(final, e_t_m=ours.holdout.e_t_m, e_R=ours.holdout.e_R)
+    if (score := ours.judgement.figures.holdout) is not None:
+        final = replace(final, e_t_m=score.e_t_m, e_R=score.e_R)
     return [*rows, replace(final, time_ms=ours_ms, note="time with held-out scores, outliers and proof")]
 
 

@@ -20,12 +20,11 @@ from calibrate.handeye.priors import BoardTolerance
 from calibrate.results import (
     Arm,
     BoardShape,
-    Certificate,
-    CrossValidation,
-    HoldoutScore,
     Posterior,
-    RejectedView,
+    QualityFigures,
     Remark,
+    ViewQuality,
+    Views,
 )
 from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, Transform
@@ -193,77 +192,36 @@ class Explanation:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """X with its uncertainty, quality figures and warnings."""
+class FittedCell:
+    """What the fit found: camera, lens, board and arm, with what is uncertain about them."""
 
     mount: Mount
-    profile: Profile
     parent_from_child: Transform
-    """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand)."""
+    """X: flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand)."""
     covariance: Array
-    """(6, 6)"""
+    """(6, 6) of X."""
     confidence_threshold: float
     """Limit of δᵀ C⁻¹ δ that holds the true X in 95 % of cases: 6·F(6, ν), ν = 3N - 6."""
     board_place: Transform
     """base_from_board or flange_from_board."""
     camera: CameraModel
-    """Final intrinsics."""
-    rms_px: float | None
-    """Corners against the model with the robot's poses adjusted within their noise; None without pixels."""
-    used: tuple[int, ...]
-    """Pose numbers."""
-    rejected: tuple[RejectedView, ...]
-    certificate: Certificate
-    observability: Observability
-    holdout: HoldoutScore | None = None
-    kept: tuple[BoardView, ...] = ()
-    """The used views as the solver read them, boards turned where that was needed."""
-    turned: tuple[int, ...] = ()
-    """Views whose corner order was turned by 180° to agree with the others, and kept."""
-    weights: dict[int, float] = field(default_factory=dict)
-    """Pose number → weight of the view, 0 (rejected) … 1."""
-    suspects: dict[int, float] = field(default_factory=dict)
-    """Pose number of a down-weighted view → probability that it is an outlier."""
-    session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
-    """Reading of the recording as a whole."""
-    cross_validation: CrossValidation | None = None
-    coverage: float = 0.0
-    """Share of the image inside the outlines of the boards in the used views; 0 without corners."""
+    """The lens as the fit left it."""
+    lens_covariance: Array | None = None
+    """(p, p) of `projection.intrinsics_names`; None without corners, and for the paper profile."""
     lens_estimated: bool = False
     """The lens was found from these same images."""
-    lens_finding: Finding | None = None
-    """None where no lens was given."""
-    lens_covariance: Array | None = None
-    """(p, p) of `projection.intrinsics_names`."""
     board: BoardShape | None = None
-    board_finding: Finding | None = None
+    """None without corners, and for the paper profile."""
+    arm: ArmErrors | None = None
+    """None where no errors of arm and bracket were modelled."""
     noise: MeasurementNoise | None = None
     """By restricted maximum likelihood; of corners only the smooth part, which moves the board's pose."""
-    error_shares: dict[str, float] = field(default_factory=dict)
-    arm: ArmErrors | None = None
-    without_arm: bool = False
-    """Of the arm's own error only the smooth part is stated: no model, joints or accuracy are known."""
-    predicted_error_m: float | None = None
-    """1σ (root of the mean squared length) of a point at the working distance on the camera's axis; where
-    errors of the arm are detected, that of `ArmErrors.installed`."""
-    working_distance_m: float | None = None
-    board_spread_m: float | None = None
-    """Root mean square distance of the board's origin in base (or flange), view by view, from its mean."""
-    board_spread_rad: float | None = None
-    residual_px: dict[int, float] = field(default_factory=dict)
-    """Pose number → rms of its corners."""
-    residual_robot: dict[int, tuple[float, float]] = field(default_factory=dict)
-    """Pose number → (metres, radians) between the recorded and the modelled flange."""
-    on_box: tuple[str, ...] = ()
-    """Paper profile: components of X that lie on the box of equation 22."""
-    warnings: tuple[Remark, ...] = ()
     posterior: Posterior | None = None
     """What later checks begin with; None for the paper profile and without corners."""
-    seed: int = 0
 
     @property
-    def matrix(self) -> Array:
-        """X of the fit: of the corrected arm where errors of the arm are detected."""
+    def X(self) -> Array:
+        """X (4, 4) of the fit: of the corrected arm where errors of the arm are detected."""
         return self.parent_from_child.matrix
 
     @property
@@ -274,7 +232,71 @@ class Solution:
         them.
         """
         as_it_is = None if self.arm is None else self.arm.installed
-        return (self.matrix, self.covariance) if as_it_is is None else (as_it_is.X, as_it_is.covariance)
+        return (self.X, self.covariance) if as_it_is is None else (as_it_is.X, as_it_is.covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """How good the fit is, and what speaks against it."""
+
+    figures: QualityFigures
+    observability: Observability
+    coverage: float
+    """Share of the image inside the outlines of the boards in the used views; 0 without corners."""
+    session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
+    """Reading of the recording as a whole."""
+    lens_finding: Finding | None = None
+    """None where no lens was given."""
+    board_finding: Finding | None = None
+    without_arm: bool = False
+    """Of the arm's own error only the smooth part is stated: no model, joints or accuracy are known."""
+    on_box: tuple[str, ...] = ()
+    """Paper profile: components of X that lie on the box of equation 22."""
+    warnings: tuple[Remark, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The views that X rests on, and how well each agrees with it."""
+
+    views: Views
+    kept: tuple[BoardView, ...]
+    """The used views as the solver read them, boards turned where that was needed."""
+    suspects: dict[int, float] = field(default_factory=dict)
+    """Pose number of a down-weighted view → probability that it is an outlier."""
+    residuals: tuple[ViewQuality, ...] = ()
+    """One of each used view, in their order."""
+
+    @property
+    def rms_px(self) -> dict[int, float]:
+        """Pose number → rms of its corners, px; empty without corners."""
+        return {one.index: one.rms_px for one in self.residuals if one.rms_px is not None}
+
+    @property
+    def weights(self) -> dict[int, float]:
+        """Pose number → weight of the view, 0 (rejected) … 1; empty for the paper profile."""
+        return {view.index: view.weight for view in self.views.weights}
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The answer of the solver in three parts, and how it was asked."""
+
+    fit: FittedCell
+    judgement: Judgement
+    evidence: Evidence
+    profile: Profile
+    seed: int = 0
+
+    @property
+    def matrix(self) -> Array:
+        """X (4, 4) of the fit; see `FittedCell.installed` for the X beside the controller's own flanges."""
+        return self.fit.X
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of `matrix`."""
+        return self.fit.covariance
 
     @property
     def sigma_translation_m(self) -> float:

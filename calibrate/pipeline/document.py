@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from calibrate.boards.model import ambiguity_text
@@ -20,17 +21,15 @@ from calibrate.files.calibration import (
     Quality,
     SessionReading,
     Sigma,
-    ViewQuality,
-    Views,
-    ViewWeight,
 )
 from calibrate.files.validity import time_text
 from calibrate.handeye.arm_table import FramePose
-from calibrate.handeye.solution import Solution
+from calibrate.handeye.noise_scales import MeasurementNoise
+from calibrate.handeye.solution import Judgement, Solution
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.pipeline.recorded_views import LoadedViews
-from calibrate.results import Gate, Remark
+from calibrate.results import Gate, Remark, Views, ViewWeight
 from calibrate.views.projection import intrinsics_names
 from calibrate.views.view_set import ViewSet
 from recordings.geometry import Transform
@@ -40,7 +39,6 @@ from recordings.schema.messages import BoardKind
 from recordings.software import software_versions
 
 _PACKAGES = ("calibration-station", "numpy", "scipy", "opencv-python-headless", "clarabel")
-_DEG = float(np.degrees(1.0))
 
 
 def make_calibration(
@@ -54,27 +52,24 @@ def make_calibration(
 ) -> Calibration:
     """`options`: the choices that differ from the defaults."""
     info = recording.info
-    frames, (X, covariance) = solution.parent_from_child, solution.installed
+    cell = solution.fit
+    X, covariance = cell.installed
+    frames = cell.parent_from_child
     return Calibration(
         format=FORMAT,
         created=time_text(),
         source=info.source,
-        mount=solution.mount,
+        mount=cell.mount,
         result=FramePose.of(Transform(frames.parent, frames.child, X)),
         sigma=Sigma.of(covariance),
         covariance=tuple(tuple(row) for row in covariance.tolist()),
-        confidence_threshold=float(solution.confidence_threshold),
-        board_place=FramePose.of(solution.board_place),
+        confidence_threshold=float(cell.confidence_threshold),
+        board_place=FramePose.of(cell.board_place),
         intrinsics=_lens(views, intrinsics, solution),
         board=loaded.board,
         robot=info.robot,
         camera=info.camera_identity,
-        views=Views(
-            used=list(solution.used),
-            rejected=sorted((*loaded.without_board, *solution.rejected), key=lambda view: view.index),
-            turned=list(solution.turned),
-            weights=[ViewWeight(i, round(w, 4)) for i, w in solution.weights.items()],
-        ),
+        views=_views(solution.evidence.views, loaded),
         quality=_quality(solution, gates, loaded, intrinsics),
         provenance=Provenance(
             recording=plain_text(recording.path.name),
@@ -87,8 +82,8 @@ def make_calibration(
             recorded_wall_ns=info.created_wall_ns,
             plan_sha256=info.plan_sha256,
         ),
-        arm_table=None if solution.arm is None else solution.arm.result,
-        posterior=solution.posterior,
+        arm_table=None if cell.arm is None else cell.arm.result,
+        posterior=cell.posterior,
     )
 
 
@@ -110,10 +105,18 @@ def _source_sha256() -> str:
     return digest.hexdigest()
 
 
+def _views(views: Views, loaded: LoadedViews) -> Views:
+    """Add the views that never reached the solver, and round the weights."""
+    rejected = sorted((*loaded.without_board, *views.rejected), key=lambda view: view.index)
+    weights = [ViewWeight(view.index, round(view.weight, 4)) for view in views.weights]
+    return msgspec.structs.replace(views, rejected=rejected, weights=weights)
+
+
 def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> Lens:
-    camera, covariance = solution.camera, solution.lens_covariance
+    camera = solution.fit.camera
+    covariance = solution.fit.lens_covariance
     sigma = [] if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    if not solution.residual_px:  # board poses were told: nothing is known of the lens
+    if not solution.evidence.rms_px:  # board poses were told: nothing is known of the lens
         return Lens(0, 0, (), (), camera.distortion_model, None, "not known")
     if intrinsics is not None:
         rms_px = intrinsics.rms_px
@@ -132,10 +135,10 @@ def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> 
     )
 
 
-def _session(solution: Solution) -> SessionReading:
-    session = solution.session
+def _session(judgement: Judgement) -> SessionReading:
+    session = judgement.session
     code = session.reading.value
-    text = next((remark.text for remark in solution.warnings if remark.code == code), "")
+    text = next((remark.text for remark in judgement.warnings if remark.code == code), "")
     others = [reading.value for reading in session.readings[1:]]
     if session.numbers is None:
         return SessionReading(code, text, others)
@@ -149,34 +152,31 @@ def _quality(
     loaded: LoadedViews,
     intrinsics: Intrinsics | None,
 ) -> Quality:
-    noise = solution.noise
+    cell = solution.fit
+    judgement = solution.judgement
     remarks = _remarks(solution, loaded, intrinsics)
     return Quality(
+        **msgspec.structs.asdict(judgement.figures),
         gates=list(gates),
-        certificate=solution.certificate,
-        holdout=solution.holdout,
-        rms_px=solution.rms_px,
-        views=[_view_quality(index, solution) for index in solution.used],
-        board_spread_mm=_scaled(solution.board_spread_m, 1e3),
-        board_spread_deg=_scaled(solution.board_spread_rad, _DEG),
-        predicted_error_mm=_scaled(solution.predicted_error_m, 1e3),
-        working_distance_m=solution.working_distance_m,
-        noise={}
-        if noise is None
-        else {
-            "corner_px": noise.corner_px,
-            "robot_mm": noise.robot_m * 1e3,
-            "robot_deg": noise.robot_rad * _DEG,
-        },
-        error_shares=solution.error_shares,
-        weakest=solution.observability.weakest_text,
-        board=solution.board,
-        cross_validation=solution.cross_validation,
-        session=_session(solution),
-        arm=None if solution.arm is None else solution.arm.stated,
+        views=list(solution.evidence.residuals),
+        noise=_noise(cell.noise),
+        weakest=judgement.observability.weakest_text,
+        board=cell.board,
+        session=_session(judgement),
+        arm=None if cell.arm is None else cell.arm.stated,
         warnings=[remark.text for remark in remarks],
         warning_codes=[remark.code for remark in remarks],
     )
+
+
+def _noise(noise: MeasurementNoise | None) -> dict[str, float]:
+    if noise is None:
+        return {}
+    return {
+        "corner_px": noise.corner_px,
+        "robot_mm": 1e3 * noise.robot_m,
+        "robot_deg": float(np.degrees(noise.robot_rad)),
+    }
 
 
 def _remarks(solution: Solution, loaded: LoadedViews, intrinsics: Intrinsics | None) -> list[Remark]:
@@ -190,7 +190,7 @@ def _remarks(solution: Solution, loaded: LoadedViews, intrinsics: Intrinsics | N
             Remark("view-left-out-of-lens", f"View {i + 1} excluded from the first intrinsics: {why}.")
             for i, why in (intrinsics.dropped if intrinsics else {}).items()
         ),
-        *solution.warnings,
+        *solution.judgement.warnings,
     ]
 
 
@@ -198,12 +198,3 @@ _NO_PICTURES = (
     "No pictures: the board's poses were told. Not known, and judged by no gate: lens, image coverage, "
     "reprojection, corners taken for others."
 )
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else float(value * factor)
-
-
-def _view_quality(index: int, solution: Solution) -> ViewQuality:
-    metres, radians = solution.residual_robot.get(index, (None, None))
-    return ViewQuality(index, solution.residual_px.get(index), _scaled(metres, 1e3), _scaled(radians, _DEG))

@@ -6,14 +6,14 @@ of limits and docs/reference/gates.md (`make pages`) take all gates from here.
 
 To add one:
   1. Compute the figure in `handeye/metrics.py`; test it in tests/calibrate/handeye/test_metrics.py.
-  2. The solver sees no pictures: a figure of a picture is first a field of `views.BoardView`, filled in
+  2. Make it a field of `Judgement` in `handeye/solution.py`, or of `results.QualityFigures` where the file is
+     to hold it, too. Fill it in `handeye/describe.py`; for the paper's profile in `handeye/paper_profile.py`.
+     The solver sees no pictures: a figure of a picture is first a field of `views.BoardView`, filled in
      `recorded_views.py` (of a recording) and `pictures.py` (of pictures that a program gives).
-  3. Make it a field of `handeye.solution.Solution`, filled in `handeye/solve.py` twice: in `_describe` for
-     the default profile, in `solve_paper_profile` for the paper's.
-  4. Here add its limit and its figure; `unit` is a key of `results.UNITS_SHOWN`. A gate without a value has
+  3. Here add its limit and its figure; `unit` is a key of `results.UNITS_SHOWN`. A gate without a value has
      a function of its own that `judge` calls, such as `_session_gate`. A figure passes or fails; a warning is
      a gate that passed and has a remedy, such as `_arm_gate`, with a test of its own.
-  5. In tests/calibrate/pipeline/test_gates.py put a good value into the fixture `solution`, a bad one into
+  4. In tests/calibrate/pipeline/test_gates.py put a good value into the fixture `solution`, a bad one into
      `spoiled`.
 """
 
@@ -25,7 +25,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from calibrate.handeye.solution import Reading, Solution
+from calibrate.handeye.solution import Judgement, Reading, Solution
 from calibrate.results import Gate, Sense
 
 
@@ -79,9 +79,9 @@ def judge(
     clock_bound_s: largest bound of the time offset over the used views; None where no clocks were recorded.
     """
     limits = limits or GateLimits()
-    found = [_session_gate(solution)] if limits.session and solution.profile == "robust" else []
+    found = [_session_gate(solution.judgement)] if limits.session and solution.profile == "robust" else []
     if limits.arm and solution.profile == "robust":
-        found.append(_arm_gate(solution.without_arm, limits.arm))
+        found.append(_arm_gate(solution.judgement.without_arm, limits.arm))
     for name, value, title, sense, unit, remedy in _measured(solution, clock_bound_s):
         limit = getattr(limits, name)
         if value is not None and limit is not None:
@@ -110,45 +110,53 @@ _BOARD = "Measure the squares both ways and the flatness, correct square_m and s
 
 
 def _measured(solution: Solution, clock_bound_s: float | None) -> Iterator[_Figure]:
-    seen, folds, noise = solution.observability, solution.cross_validation, solution.noise
-    distance_m, weights = solution.working_distance_m or 0.0, list(solution.weights.values())
+    judgement = solution.judgement
+    evidence = solution.evidence
+    figures = judgement.figures
+    seen = judgement.observability
+    folds = figures.cross_validation
+    noise = solution.fit.noise
+    distance_m = figures.working_distance_m or 0.0
+    weights = list(evidence.weights.values())
     weight = float(np.mean(weights)) if weights else None
     yield _Figure(
         "weight", weight, "Mean view weight", "≥", "share", "Retake the rejected and suspect views."
     )
     remedy = "Capture more poses that show the board."
-    yield _Figure("views", len(solution.used), "View count", "≥", "", remedy)
+    yield _Figure("views", len(evidence.views.used), "View count", "≥", "", remedy)
     largest_deg = float(np.degrees(seen.largest_angle_rad))
     remedy = "Add poses with more tilt and roll."
     yield _Figure("rotation_deg", largest_deg, "Rotation range", "≥", "deg", remedy)
     remedy = f"Add rotations about other axes: {seen.weakest_text}."
     yield _Figure("axis_spread", seen.axis_spread, "Rotation diversity", "≥", "", remedy)
-    if px := solution.residual_px:
+    if px := evidence.rms_px:
         worst = max(px, key=lambda index: px[index])
         title = f"Largest rms error of a view (pose {worst + 1})"
         remedy = f"Retake pose {worst + 1}, or check the intrinsics."
         yield _Figure("view_rms_px", px[worst], title, "≤", "px", remedy)
-    if solution.holdout is not None and distance_m:
-        missed_m = solution.holdout.e_t_m
+    if figures.holdout is not None and distance_m:
+        missed_m = figures.holdout.e_t_m
         title = f"Held-out error ({1e3 * missed_m:.2g} mm)"
         remedy = "Check robot accuracy and corner detection."
         yield _Figure("holdout_share", missed_m / distance_m, title, "≤", "share", remedy)
     if folds is not None:
-        figures = f"({folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm; 1 is what chance explains)"
+        errors = f"({folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm; 1 is what chance explains)"
         ratio = folds.rms_mm / folds.claimed_mm / folds.limit
         remedy = "Check intrinsics, board and looseness of the mounts."
-        yield _Figure("cross_validation", ratio, f"Cross-validated error {figures}", "≤", "", remedy)
+        yield _Figure("cross_validation", ratio, f"Cross-validated error {errors}", "≤", "", remedy)
     title = f"Predicted error at {distance_m * 1e3:.0f} mm"
     remedy = f"Least known: {seen.weakest_text}. Add rotations about that direction."
-    yield _Figure("predicted_error_m", solution.predicted_error_m, title, "≤", "m", remedy)
-    coverage = solution.coverage if solution.lens_estimated else None
+    error_mm = figures.predicted_error_mm
+    error_m = None if error_mm is None else error_mm / 1e3
+    yield _Figure("predicted_error_m", error_m, title, "≤", "m", remedy)
+    coverage = judgement.coverage if solution.fit.lens_estimated else None
     remedy = "Bring the board into the corners of the image."
     yield _Figure("coverage", coverage, "Image coverage", "≥", "share", remedy)
     remedy = "Check the camera's clock, or use a hardware trigger."
     yield _Figure("clock_bound_s", clock_bound_s, "Time sync", "≤", "s", remedy)
     for name, finding, title, remedy in (
-        ("lens_pull", solution.lens_finding, "Shift by fixed intrinsics", _LENS),
-        ("board_pull", solution.board_finding, "Shift by the stated board", _BOARD),
+        ("lens_pull", judgement.lens_finding, "Shift by fixed intrinsics", _LENS),
+        ("board_pull", judgement.board_finding, "Shift by the stated board", _BOARD),
     ):
         if finding is not None:
             of_mm = f"{finding.unexplained_m * 1e3:.2f} of {finding.pull_m * 1e3:.2f} mm"
@@ -168,10 +176,10 @@ def _arm_gate(without: bool, limit: Literal["warn", "fail"]) -> Gate:
     return Gate("arm", limit == "warn", None, None, text, remedy=remedy)
 
 
-def _session_gate(solution: Solution) -> Gate:
-    session = solution.session
+def _session_gate(judgement: Judgement) -> Gate:
+    session = judgement.session
     passed = session.reading is Reading.AS_RECORDED
-    told = next((remark.text for remark in solution.warnings if remark.code == session.reading.value), "")
+    told = next((remark.text for remark in judgement.warnings if remark.code == session.reading.value), "")
     remedy = "" if passed else told
     found = "yes PASS" if passed else f"no, {session.reading.value} FAIL. {told}"
     text = f"Poses and board as told: {found}".rstrip()

@@ -222,6 +222,6 @@ def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:
 
 
 def _clock_bound_s(recording: Recording, solution: Solution) -> float | None:
-    used = set(solution.used)
+    used = set(solution.evidence.views.used)
     bounds = [v.time_bound_s for v in recording.views() if v.index in used and v.time_bound_s is not None]
     return max(bounds) if bounds else None

@@ -41,12 +41,12 @@ class Solved:
 
         For the arm as it is, like a calibration file.
         """
-        return self.solution.installed[0]
+        return self.solution.fit.installed[0]
 
     @property
     def lens(self) -> CameraModel:
         """The given lens or the one found, as the fit left it."""
-        return self.solution.camera
+        return self.solution.fit.camera
 
     def covariance(
         self, order: Literal["translation-rotation", "rotation-translation"] = "translation-rotation"
@@ -58,25 +58,25 @@ class Solved:
         """
         require_choice("order", order, ("translation-rotation", "rotation-translation"))
         shift = 3 * (order == "rotation-translation")
-        return np.roll(self.solution.installed[1], (shift, shift), (0, 1))
+        return np.roll(self.solution.fit.installed[1], (shift, shift), (0, 1))
 
     @cached_property
     def residuals_px(self) -> dict[int, Array]:
         """Number of a picture → (k, 2): its corners less where calibration and recorded pose put them."""
-        solution, mount = self.solution, self.views.mount
+        cell = self.solution.fit
         observed = observe_views(replace(self.views, views=self._as_read))
-        shape = np.zeros(len(SHAPE)) if solution.board is None else solution.board.numbers
+        shape = np.zeros(len(SHAPE)) if cell.board is None else cell.board.numbers
         points = bent_points(observed, shape)
-        seen = board_in_camera(mount, observed.flange, self.X, solution.board_place.matrix)
+        seen = board_in_camera(cell.mount, observed.flange, self.X, cell.board_place.matrix)
         return {
-            view.index: view.pixels - project_at(solution.camera, seen[i], points[i, : len(view.pixels)])
+            view.index: view.pixels - project_at(cell.camera, seen[i], points[i, : len(view.pixels)])
             for i, view in enumerate(self._as_read)
         }
 
     @property
     def _as_read(self) -> tuple[BoardView, ...]:
         """The views with boards that look the same turned as the solver turned them."""
-        kept = {view.index: view for view in self.solution.kept}
+        kept = {view.index: view for view in self.solution.evidence.kept}
         return tuple(kept.get(view.index, view) for view in self.views)
 
     def plot(self) -> Figure:
@@ -94,7 +94,7 @@ class Solved:
                 self.savefig(file := BytesIO())
                 return file.getvalue()
 
-        used, figure = set(self.solution.used), Shown(layout="constrained")
+        used, figure = set(self.solution.evidence.views.used), Shown(layout="constrained")
         pixels = np.concatenate([view.pixels for view in self._as_read])
         missed = np.concatenate(list(self.residuals_px.values()))
         good = np.concatenate([[index in used] * len(miss) for index, miss in self.residuals_px.items()])

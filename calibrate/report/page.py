@@ -106,8 +106,9 @@ def _could_be_better(job: SolvedRecording) -> list[str]:
 
 def _picture(job: SolvedRecording) -> str:
     """The used view where the board is placed worst, with the board drawn in."""
-    robot = job.solution.residual_robot
-    used = [view for view in job.recording.views() if view.index in robot.keys() & job.loaded.detections]
+    compared = {one.index for one in job.solution.evidence.residuals if one.robot_mm is not None}
+    shown = compared & job.loaded.detections.keys()
+    used = [view for view in job.recording.views() if view.index in shown]
     if not used:
         return ""
     view = max(used, key=lambda view: _placed(job, view)[2])
@@ -213,14 +214,14 @@ def _error(job: SolvedRecording) -> Iterator[str]:
 
 
 def _plots(job: SolvedRecording) -> Iterator[str]:
-    solution = job.solution
-    if px := solution.residual_px:
+    evidence = job.solution.evidence
+    if px := evidence.rms_px:
         limit = next((gate.limit for gate in job.gates if gate.name == "view_rms_px"), None)
         worst = max(px, key=lambda index: px[index])
         against = "." if limit is None else f" (limit {limit:g} px)."
         answer = f"Largest: pose {worst + 1}, {px[worst]:.2f} px{against}"
         yield html.figure(html.bars(px, "px", limit), answer, "Does an image stand out?")
-    if robot_mm := {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}:
+    if robot_mm := {one.index: one.robot_mm for one in evidence.residuals if one.robot_mm is not None}:
         worst = max(robot_mm, key=lambda index: robot_mm[index])
         answer = f"Largest: pose {worst + 1}, {robot_mm[worst]:.2f} mm from where the image says."
         yield html.figure(html.bars(robot_mm, "mm"), answer, "Was the arm where it said?")
@@ -253,7 +254,8 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         rows = [(str(view.index + 1), view.name, view.reason) for view in rejected]
         yield html.table(("pose", "name", "reason"), rows)
     left_out = {view.index for view in rejected}
-    figures, suspects = dict[float, str](), job.solution.suspects
+    figures = dict[float, str]()
+    suspects = job.solution.evidence.suspects
     for view in job.recording.views():
         seen = job.loaded.detections.get(view.index)
         if seen is None or not seen.found:  # the table above says why

@@ -156,7 +156,7 @@ def sigmas_of(solution: Solution, truth: Array) -> float:
 
 def inside(solution: Solution, truth: Array) -> bool:
     """Does the stated 95 % region hold the truth?"""
-    return sigmas_of(solution, truth) < solution.confidence_threshold
+    return sigmas_of(solution, truth) < solution.fit.confidence_threshold
 
 
 def inverse_nearest(model: RobotModel, base_from_flange: Array, near_rad: ArrayLike) -> Array | None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.files.calibration import FORMAT, Calibration, Lens, Provenance, Quality, Sigma, Views
+from calibrate.files.calibration import FORMAT, Calibration, Lens, Provenance, Quality, Sigma
 from calibrate.handeye.arm_table import FramePose
-from calibrate.results import Certificate
+from calibrate.results import Certificate, Views
 from calibrate.views.projection import project_at
 from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, Transform, inverse, perturb
@@ -52,8 +52,8 @@ def calibration_of(
         camera=camera,
         views=Views(list(range(25))),
         quality=Quality(
-            [],
-            Certificate(True, 0.0, 0.0, None, ""),
+            gates=[],
+            certificate=Certificate(True, 0.0, 0.0, None, ""),
             noise={
                 "corner_px": CORNER_PX,
                 "robot_mm": 1e3 * ROBOT_M,

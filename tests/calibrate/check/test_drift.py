@@ -106,12 +106,12 @@ def test_errors_of_an_arm_that_nobody_described_are_no_shift(mount: Mount) -> No
     for seed in range(900, 902):
         cell = arm_cell("seven joints", mount, 0.3, seed)
         solution = solve_views(cell.views, QUICK)
-        known = KnownCell.of(solution.posterior, solution.camera)
+        known = KnownCell.of(solution.fit.posterior, solution.fit.camera)
         views = later_views(cell, np.zeros(6), 0, 6)
         still = check_drift(views, known)
         assert still.arm_known and still.p_value > 1e-3
         # as heavy tails as the fit's region, which is an average over sizes of errors
-        assert still.threshold == pytest.approx(solution.confidence_threshold) and known.freedom < 60
+        assert still.threshold == pytest.approx(solution.fit.confidence_threshold) and known.freedom < 60
         assert not check_drift(later_views(cell, np.r_[1e-3, 0, 0, 0, 0, 0], 0, 6), known).passed
     assert _with_joints(views, known, np.degrees).statistic == pytest.approx(still.statistic, rel=1e-6)
     assert not _with_joints(views, known, lambda q: 1.1 * q).arm_known, "not this arm's"
@@ -131,7 +131,7 @@ def test_without_joints_an_arm_errs_smoothly_at_other_postures(mount: Mount) -> 
     for stated_m in (None, 6e-4):
         cell = arm_cell("ur", mount, 0.3, 902, joints=stated_m is None)
         solution = solve_views(cell.views, replace(QUICK, robot_accuracy_m=stated_m))
-        known = KnownCell.of(solution.posterior, solution.camera)
+        known = KnownCell.of(solution.fit.posterior, solution.fit.camera)
         still = [_with_joints(later_views(cell, np.zeros(6), k, 6), known, lambda _: None) for k in range(4)]
         assert min(check.p_value for check in still) > 1e-3 and still[0].arm_known == bool(stated_m)
         away = later_views(cell, np.r_[2e-3, np.zeros(5)], 0, 6)

@@ -51,7 +51,7 @@ def four_corners(views: ViewSet) -> ViewSet:
 
 def test_a_shift_is_noticed_within_ten_pictures_and_nothing_else(cell: ArmCell) -> None:
     solution = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
-    known = KnownCell.of(solution.posterior, solution.camera).with_board(BoardTolerance())
+    known = KnownCell.of(solution.fit.posterior, solution.fit.camera).with_board(BoardTolerance())
     before = four_corners(later_views(cell, STILL, 1, EARLIER))
     earlier = EarlierPictures.of(before, known)
     after = four_corners(later_views(cell, STILL, 2, 30))

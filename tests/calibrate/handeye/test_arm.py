@@ -50,7 +50,7 @@ def test_a_bracket_that_bends_leaves_the_truth_in_the_region(mount: Mount) -> No
     cell = imperfect_cell(np.random.default_rng(2), mount, bends, noise=LOW)
     solution = solve_views(cell.views, QUICK)
     assert inside(solution, cell.X)
-    assert error_mm_deg(solution.parent_from_child.matrix, cell.X)[0] < 0.25
+    assert error_mm_deg(solution.fit.parent_from_child.matrix, cell.X)[0] < 0.25
 
 
 def test_table_errors_are_found_and_coverage_comes_back():
@@ -59,11 +59,11 @@ def test_table_errors_are_found_and_coverage_comes_back():
     for _ in range(2):
         worn = worn_cell(rng, 0.4)
         found = solve_views(worn.views, QUICK)
-        assert found.arm.stated.log_bayes > 3 and found.arm.stated.applied
-        shift_mm, turn_mrad = found.arm.stated.size_mm, found.arm.stated.size_mrad
+        assert found.fit.arm.stated.log_bayes > 3 and found.fit.arm.stated.applied
+        shift_mm, turn_mrad = found.fit.arm.stated.size_mm, found.fit.arm.stated.size_mrad
         assert 0.1 < shift_mm < 1.0 and 0.1 < turn_mrad < 1.0 and shift_mm != turn_mrad
-        assert "arm-systematics" in {remark.code for remark in found.warnings}
-        assert found.rejected == ()
+        assert "arm-systematics" in {remark.code for remark in found.judgement.warnings}
+        assert found.evidence.views.rejected == ()
         held["with"] += inside(found, worn.X)
         plain = without_arm(worn.views)
         off = difference(plain.state.X, worn.X)
@@ -77,9 +77,9 @@ def test_a_good_arm_is_not_accused_and_costs_little():
     for _ in range(2):
         worn = worn_cell(rng, 0.0)
         found = solve_views(worn.views, QUICK)
-        assert found.arm.stated.log_bayes < 3 and not found.arm.stated.applied
-        assert found.arm.result.refused == "no-evidence"
-        assert "arm-systematics" not in {remark.code for remark in found.warnings}
+        assert found.fit.arm.stated.log_bayes < 3 and not found.fit.arm.stated.applied
+        assert found.fit.arm.result.refused == "no-evidence"
+        assert "arm-systematics" not in {remark.code for remark in found.judgement.warnings}
         plain_m = np.sqrt(np.trace(without_arm(worn.views).covariance[:3, :3]))
         prices.append(found.sigma_translation_m / plain_m)
     assert 0.95 < np.mean(prices) < 1.3
@@ -88,7 +88,7 @@ def test_a_good_arm_is_not_accused_and_costs_little():
 def test_without_joints_the_poses_serve():
     worn = worn_cell(np.random.default_rng(0), 0.4)
     found = solve_views(without_joints(worn.views), QUICK)
-    assert found.arm.stated.applied and found.arm.result.refused == "no-joints"
+    assert found.fit.arm.stated.applied and found.fit.arm.result.refused == "no-joints"
     assert inside(found, worn.X)
 
 
@@ -96,11 +96,11 @@ def test_without_joints_the_poses_serve():
 def test_the_stated_region_is_wider_for_fewer_views_with_and_without_the_arm(count):
     """6·F(6, ν), ν = 3n - 6 of the n views that count: never the limit of a noise that is known exactly."""
     solution = solve_views(worn_views(0.4).select(list(range(count))), QUICK)
-    assert (solution.arm is None) == (count == 7)
-    counted = sum(1 - solution.suspects.get(index, 0.0) for index in solution.used)
+    assert (solution.fit.arm is None) == (count == 7)
+    counted = sum(1 - solution.evidence.suspects.get(index, 0.0) for index in solution.evidence.views.used)
     expected = 6 * stats.f.ppf(0.95, 6, 3 * counted - 6)
-    assert solution.confidence_threshold == pytest.approx(expected, rel=0.03)
-    assert solution.confidence_threshold > 1.04 * stats.chi2.ppf(0.95, 6)
+    assert solution.fit.confidence_threshold == pytest.approx(expected, rel=0.03)
+    assert solution.fit.confidence_threshold > 1.04 * stats.chi2.ppf(0.95, 6)
 
 
 def test_the_region_of_an_average_holds_95_percent_of_it():
@@ -140,11 +140,11 @@ def test_a_fit_of_errors_that_fails_is_said_and_does_not_cost_the_other(failing,
 
     monkeypatch.setattr(cell_fit, "estimate_with_arm_errors", fails)
     found = solve_views(worn_views(0.4), QUICK)
-    assert (found.arm is None) == (found.posterior.arm is None) == (39 in failing)
-    assert (found.posterior.flange_extent_m is None) == (63 in failing)
-    assert (found.posterior.level is None) == (len(failing) == 2)
-    assert found.posterior.without_joints is None
-    assert "arm-not-fitted" in {remark.code for remark in found.warnings}
+    assert (found.fit.arm is None) == (found.fit.posterior.arm is None) == (39 in failing)
+    assert (found.fit.posterior.flange_extent_m is None) == (63 in failing)
+    assert (found.fit.posterior.level is None) == (len(failing) == 2)
+    assert found.fit.posterior.without_joints is None
+    assert "arm-not-fitted" in {remark.code for remark in found.judgement.warnings}
 
 
 def motion_of(views: ViewSet) -> Array:
@@ -195,7 +195,7 @@ def test_wrong_poses_cost_no_more_than_their_views():
     flange = cell.views.base_from_flange
     flange[[4, 11]], flange[7, 0, 3] = flange[[11, 4]], 10.0
     spoilt, good = with_flange(cell.views, flange), [i for i in range(25) if i not in (4, 7, 11)]
-    assert inside(solution := solve_views(spoilt, QUICK), cell.X) and solution.arm.stated.applied
+    assert inside(solution := solve_views(spoilt, QUICK), cell.X) and solution.fit.arm.stated.applied
     spoilt, sound = (solve_views(without_joints(views), QUICK) for views in (spoilt, cell.views.select(good)))
     assert spoilt.sigma_translation_m == pytest.approx(sound.sigma_translation_m, rel=0.1)
     assert spoilt.posterior.flange_extent_m == pytest.approx(sound.posterior.flange_extent_m, rel=1e-3)
@@ -210,8 +210,8 @@ def test_an_arm_without_joints_is_honest_by_its_stated_accuracy(mount):
         for stated in covered:
             options = replace(QUICK, robot_accuracy_m=6e-4 if stated else None)
             solution = solve_views(cell.views, options)
-            assert solution.without_arm is not stated
-            assert sum(solution.error_shares.values()) == pytest.approx(1.0)
+            assert solution.judgement.without_arm is not stated
+            assert sum(solution.judgement.figures.error_shares.values()) == pytest.approx(1.0)
             covered[stated] += inside(solution, cell.X)
     assert covered[True] == 2 > covered[False]
 

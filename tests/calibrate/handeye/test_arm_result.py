@@ -44,11 +44,11 @@ def solved(worn: Worn) -> Solution:
 
 
 def table_of(solution: Solution) -> CorrectedArm:
-    return solution.arm.result
+    return solution.fit.arm.result
 
 
 def as_it_is(solution: Solution) -> UncorrectedArm:
-    return solution.arm.uncorrected
+    return solution.fit.arm.uncorrected
 
 
 def spread(flange: Array, X: Array, C: Array) -> float:
@@ -68,7 +68,8 @@ def test_the_table_with_its_own_x_is_best_at_new_poses(worn: Worn, solved: Solut
     uncorrected = spread(nominal, as_it_is(solved).X, worn.new_board_poses)
     assert both < 0.6 * uncorrected
     assert table.with_table_mm < 0.7 * table.without_table_mm
-    assert solved.predicted_error_m == as_it_is(solved).error_m, "that of the X which is installed"
+    stated_mm = solved.judgement.figures.predicted_error_mm
+    assert stated_mm == 1e3 * as_it_is(solved).error_m, "that of the X which is installed"
     told = Solved(worn.views, solved, ())
     np.testing.assert_array_equal(told.X, as_it_is(solved).X)
     np.testing.assert_array_equal(told.covariance(), as_it_is(solved).covariance)
@@ -82,7 +83,7 @@ def test_held_out_poses_elsewhere_say_the_same(solved: Solution) -> None:
 
 def test_a_table_that_fails_elsewhere_is_not_offered(worn: Worn, monkeypatch: pytest.MonkeyPatch) -> None:
     worse = np.tile([[1e-3], [2e-3]], (1, 25))
-    monkeypatch.setattr("calibrate.handeye.solve.held_out_elsewhere", lambda fit, joints: worse)
+    monkeypatch.setattr("calibrate.handeye.describe.held_out_elsewhere", lambda fit, joints: worse)
     assert table_of(solve_views(worn.views, replace(QUICK, folds=True))).refused == "not-better"
 
 

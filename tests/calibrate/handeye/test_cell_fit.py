@@ -30,8 +30,10 @@ def moved_cell(seed, mount, what, at, views=24, size=1.0):
 def test_a_move_half_way_is_named_with_its_place_and_does_not_pass(mount, what, size):
     views, _, _ = moved_cell(0, mount, what, 12, size=size)
     solution = solve_views(views, QUICK)
-    assert solution.session.reading is (Reading.CAMERA_MOVED if what == "camera" else Reading.BOARD_MOVED)
-    assert abs(solution.session.at - 12) <= 1
+    assert solution.judgement.session.reading is (
+        Reading.CAMERA_MOVED if what == "camera" else Reading.BOARD_MOVED
+    )
+    assert abs(solution.judgement.session.at - 12) <= 1
     assert "session" in [g.name for g in judge(solution) if not g.passed]
 
 
@@ -57,7 +59,7 @@ def test_half_turned_boards_are_set_right_and_used(mount):
         camera_from_board=lambda v: v.camera_from_board @ half_turn(v),
     )
     solution, straight = solve_views(views, QUICK), solve_views(cell.views, QUICK)
-    assert (solution.turned, straight.turned) == ((2, 9, 15), ())
-    assert solution.rejected == () and min(solution.weights.values()) > 0.3
+    assert (solution.evidence.views.turned, straight.evidence.views.turned) == ([2, 9, 15], [])
+    assert solution.evidence.views.rejected == [] and min(solution.evidence.weights.values()) > 0.3
     np.testing.assert_allclose(solution.matrix, straight.matrix, atol=1e-6)
     np.testing.assert_allclose(solution.covariance, straight.covariance, rtol=1e-3, atol=1e-15)

@@ -39,9 +39,9 @@ def test_without_noise_the_truth_is_found(mount, model, options):
     solution = solve_views(cell.views, options)
     mm, degrees = error_mm_deg(solution.matrix, cell.X)
     assert mm < 1e-3 and degrees < 1e-3
-    assert error_mm_deg(solution.board_place.matrix, cell.Y)[0] < 1e-2
-    assert solution.camera.matrix[0][0] == pytest.approx(cell.camera.matrix[0][0], rel=1e-5)
-    assert list(solution.weights.values()) == pytest.approx([1.0] * 12, abs=0.05)
+    assert error_mm_deg(solution.fit.board_place.matrix, cell.Y)[0] < 1e-2
+    assert solution.fit.camera.matrix[0][0] == pytest.approx(cell.camera.matrix[0][0], rel=1e-5)
+    assert list(solution.evidence.weights.values()) == pytest.approx([1.0] * 12, abs=0.05)
 
 
 def drawn_from_the_priors(seed, mount):
@@ -69,7 +69,7 @@ def test_the_stated_region_holds_the_truth_as_often_as_it_says():
     for seed in range(10):
         cell = drawn_from_the_priors(seed, ("eye-in-hand", "eye-to-hand")[seed % 2])
         solution = solve_views(cell.views, QUICK)
-        assert solution.rejected == ()
+        assert solution.evidence.views.rejected == []
         squares.append(sigmas_of(solution, cell.X))
         held += inside(solution, cell.X)
     assert held >= 8
@@ -92,7 +92,7 @@ def test_smooth_corner_errors_are_in_the_claim():
         rng = np.random.default_rng([3, seed])
         cell = real_cell(rng, 20, LOW, bias_px=0.3)
         solution = solve_views(cell.views, QUICK)
-        assert solution.noise.corner_px > 2 * LOW.corner_px
+        assert solution.fit.noise.corner_px > 2 * LOW.corner_px
         held += inside(solution, cell.X)
     assert held >= 3
 
@@ -104,7 +104,7 @@ SHAPE = (0.005, 0.006, 0.0008, -0.0006, 0.0004)
 def test_a_scaled_unequal_and_bent_board_is_found_with_its_numbers(mount):
     cell = real_cell(np.random.default_rng(7), 25, LOW, mount=mount, shape=SHAPE)
     solution = solve_views(cell.views, QUICK)
-    board = solution.board
+    board = solution.fit.board
     found = np.array([board.scale, board.anisotropy, *board.bend_m])
     assert (np.abs(found - SHAPE) < 3.5 * np.array(board.sigma)).all()
     assert (np.abs(found) > 3 * np.array(board.sigma)).all()
@@ -121,8 +121,8 @@ def test_what_was_measured_well_earns_a_smaller_error():
     usual, known, measured, unknown = (solve_views(cell.views, o) for o in (QUICK, lens, board, SAME))
     assert known.sigma_translation_m < usual.sigma_translation_m < unknown.sigma_translation_m
     assert measured.sigma_translation_m < usual.sigma_translation_m
-    assert measured.error_shares["board"] < usual.error_shares["board"]
-    assert unknown.error_shares["intrinsics"] > 0.2
+    assert measured.judgement.figures.error_shares["board"] < usual.judgement.figures.error_shares["board"]
+    assert unknown.judgement.figures.error_shares["intrinsics"] > 0.2
 
 
 def test_wrong_corners_hardly_move_it():
@@ -133,7 +133,7 @@ def test_wrong_corners_hardly_move_it():
         off = shift * (np.arange(42) == k)[:, None]
         views = changed(views, [i], pixels=lambda v, off=off: v.pixels + off)
     spoilt = solve_views(views, QUICK)
-    assert spoilt.rejected == ()
+    assert spoilt.evidence.views.rejected == []
     delta = difference(spoilt.matrix, clean.matrix)
     assert delta @ np.linalg.solve(clean.covariance, delta) < 1.0
 
@@ -149,7 +149,7 @@ def test_wrong_corners_hardly_move_it():
 def test_the_dominant_source_of_noise_is_named(noise, expected):
     """Among what more views would mend; lens and board are counted apart from it."""
     cell = make_cell(np.random.default_rng(0), 25, noise)
-    shares = solve_views(cell.views, QUICK).error_shares
+    shares = solve_views(cell.views, QUICK).judgement.figures.error_shares
     assert max(("corners", "robot_translation", "robot_rotation"), key=lambda name: shares[name]) == expected
     assert sum(shares.values()) == pytest.approx(1.0, abs=1e-6)
     assert set(shares) > {"intrinsics", "board", "kinematics"}

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
-from calibrate.handeye import diagnosis
-from calibrate.handeye import solve as profile_robust
+from calibrate.handeye import describe, diagnosis
 from calibrate.handeye.cell_fit import fit_cell
 from calibrate.handeye.diagnosis import cross_validate
 from calibrate.handeye.estimate import estimate
@@ -40,10 +40,11 @@ def test_the_held_out_views_of_a_solve_leave_its_partial_fit_alone(monkeypatch):
     views = make_cell(np.random.default_rng(0), VIEWS, MID).views
     last = list(range(VIEWS - HELD_OUT, VIEWS))
     slips = 1e-3 * np.random.default_rng(1).normal(size=(HELD_OUT, 6))
-    judged, score = [], profile_robust.score_holdout
-    monkeypatch.setattr(profile_robust, "score_holdout", lambda X, *a: judged.append(X) or score(X, *a))
+    judged, score = [], describe.score_holdout
+    monkeypatch.setattr(describe, "score_holdout", lambda X, *a: judged.append(X) or score(X, *a))
     scores = [
-        solve_views(seen, SolveOptions(folds=False)).holdout for seen in (views, nudged(views, last, slips))
+        solve_views(seen, SolveOptions(folds=False)).judgement.figures.holdout
+        for seen in (views, nudged(views, last, slips))
     ]
     assert scores[0].fitted_views == VIEWS - HELD_OUT
     assert min(place for pair in scores[0].pairs for place in pair) == last[0]
@@ -75,7 +76,7 @@ def test_sound_claims_are_confirmed(mount):
     for seed in range(2):
         cell = make_cell(np.random.default_rng(seed), 15, LOW if seed % 2 else MID, mount=mount)
         solution = solve_views(cell.views, CV)
-        cv = solution.cross_validation
+        cv = solution.judgement.figures.cross_validation
         assert cv.folds == 5
         assert 0.5 < cv.rms_mm / cv.claimed_mm < cv.limit
         assert all(g.passed for g in judge(solution) if g.name == "cross_validation")
@@ -95,11 +96,13 @@ def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
     assert boasted.claimed_mm == pytest.approx(honest.claimed_mm / 3, rel=0.01)
     assert honest.rms_mm < honest.limit * honest.claimed_mm
     assert boasted.rms_mm > boasted.limit * boasted.claimed_mm
-    solution = replace(solve_views(fit.views, replace(CV, folds=False)), cross_validation=boasted)
+    bare = solve_views(fit.views, replace(CV, folds=False))
+    figures = msgspec.structs.replace(bare.judgement.figures, cross_validation=boasted)
+    solution = replace(bare, judgement=replace(bare.judgement, figures=figures))
     assert "cross_validation" in [g.name for g in judge(solution) if not g.passed]
 
 
 def test_five_views_are_too_few_to_leave_some_out():
     views = make_cell(np.random.default_rng(0), 6, LOW).views
-    assert solve_views(views.select(list(range(5))), CV).cross_validation is None
-    assert solve_views(views, CV).cross_validation is not None
+    assert solve_views(views.select(list(range(5))), CV).judgement.figures.cross_validation is None
+    assert solve_views(views, CV).judgement.figures.cross_validation is not None

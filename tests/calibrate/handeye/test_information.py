@@ -27,8 +27,10 @@ def test_the_predicted_sigma_is_the_one_that_the_solver_states(mount):
     prior = prior_information(cell.camera, False, BoardTolerance())
     predicted = np.diag(covariance_of(each.sum(axis=0), prior))
     X = np.sqrt(np.diag(solution.covariance) / predicted[:6])
-    lens = np.sqrt(np.diag(solution.lens_covariance) / predicted[12:21])
-    shown_m = predicted_error_m(each.sum(axis=0), prior, cell.X, solution.working_distance_m)
+    lens = np.sqrt(np.diag(solution.fit.lens_covariance) / predicted[12:21])
+    shown_m = predicted_error_m(
+        each.sum(axis=0), prior, cell.X, solution.judgement.figures.working_distance_m
+    )
     assert (X > 0.8).all() and (X < 1.4).all()
     assert (lens > 0.9).all() and (lens < 1.1).all()
-    assert 0.95 < shown_m / solution.predicted_error_m < 1.05
+    assert 0.95 < 1e3 * shown_m / solution.judgement.figures.predicted_error_mm < 1.05

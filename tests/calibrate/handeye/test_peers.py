@@ -57,7 +57,7 @@ def test_the_papers_row_says_when_its_answer_lies_on_the_box():
     rows = {row.name: row for row in compare_all(cell.views)}
     assert rows["DE, paper"].on_box == ("translation x",)
     assert all(row.on_box == () for name, row in rows.items() if name != "DE, paper")
-    assert solve_views(cell.views, SolveOptions(profile="paper")).on_box == ("translation x",)
+    assert solve_views(cell.views, SolveOptions(profile="paper")).judgement.on_box == ("translation x",)
 
 
 def test_the_papers_gap_is_that_of_the_X_returned():
@@ -65,7 +65,7 @@ def test_the_papers_gap_is_that_of_the_X_returned():
     solved = solve_views(cell.views, SolveOptions(profile="paper"))
     fitted = consecutive_pairs(cell.views.base_from_flange, cell.views.camera_from_board).select(slice(0, 18))
     value = build_objective(fitted, "log").value(solved.matrix)
-    proof = solved.certificate
+    proof = solved.judgement.figures.certificate
     assert proof.objective == pytest.approx(value, rel=1e-9)
     assert proof.relative_gap == pytest.approx((value - proof.lower_bound) / max(value, proof.floor))
 

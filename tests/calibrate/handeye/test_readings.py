@@ -189,8 +189,8 @@ def test_a_misread_recording_is_refused_or_closes_the_session_gate(reading, moun
     except PosesDisagreeError as problem:
         assert problem.values["hypothesis"] == reading.value
         return
-    assert solution.session.reading is reading
-    assert reading.value in {remark.code for remark in solution.warnings}
+    assert solution.judgement.session.reading is reading
+    assert reading.value in {remark.code for remark in solution.judgement.warnings}
     assert "session" in [gate.name for gate in judge(solution) if not gate.passed]
 
 

@@ -46,8 +46,8 @@ def test_the_blogs_equations_hold_through_the_same_code_for_both_mounts(mount):
     assert error_mm_deg(solution.matrix, X)[0] < 0.3
     assert error_mm_deg(solution.matrix, X)[1] < 0.05
     expected = ("flange", "camera") if mount == "eye-in-hand" else ("base", "camera")
-    assert (solution.parent_from_child.parent, solution.parent_from_child.child) == expected
-    assert error_mm_deg(solution.board_place.matrix, cell.Y)[0] < 1.5
+    assert (solution.fit.parent_from_child.parent, solution.fit.parent_from_child.child) == expected
+    assert error_mm_deg(solution.fit.board_place.matrix, cell.Y)[0] < 1.5
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -55,14 +55,14 @@ def test_any_mount_is_found(seed):
     rng = np.random.default_rng(seed)
     X = pose(random_rotation(rng), 0.5 * rng.normal(size=3))
     solution = solve_views(make_cell(rng, 15, LOW, X=X).views, QUICK)
-    assert solution.certificate.certified
+    assert solution.judgement.figures.certificate.certified
     assert error_mm_deg(solution.matrix, X)[0] < 0.6
 
 
 def test_the_papers_split_and_score():
     cell = make_cell(np.random.default_rng(0), 25, LOW)
     solution = solve_views(cell.views, SolveOptions(profile="paper"))
-    score = solution.holdout
+    score = solution.judgement.figures.holdout
     assert score.pairs == [(n, n + 1) for n in range(18, 24)]
     assert score.fitted_views == 19
     A, B = (
@@ -79,9 +79,9 @@ def test_the_papers_split_and_score():
 def test_the_paper_profile_warns_on_the_box():
     cell = make_cell(np.random.default_rng(0), 25, LOW, X=pose(rotation_exp([0, 0, 3.1]), [0, 0, 0.1]))
     solution = solve_views(cell.views, SolveOptions(profile="paper"))
-    assert solution.on_box
-    assert "on-box" in {remark.code for remark in solution.warnings}
-    assert not solution.certificate.certified
+    assert solution.judgement.on_box
+    assert "on-box" in {remark.code for remark in solution.judgement.warnings}
+    assert not solution.judgement.figures.certificate.certified
 
 
 @BOTH
@@ -130,7 +130,7 @@ def test_a_wrong_pose_is_no_second_axis():
 def test_exact_poses_say_nothing_of_arm_and_bracket():
     cell = make_cell(np.random.default_rng(0), 15, MeasurementNoise(0.0, 0.0, 0.0), with_pnp=False)
     solution = solve_views(poses_only(cell.views.base_from_flange, cell.C))
-    assert {remark.code for remark in solution.warnings} <= {"no-corners"}
+    assert {remark.code for remark in solution.judgement.warnings} <= {"no-corners"}
     assert error_mm_deg(solution.matrix, cell.X)[0] < 1e-3
 
 
@@ -236,11 +236,12 @@ def test_a_covariance_is_positive_and_predicts_the_error_at_work():
     cell = make_cell(np.random.default_rng(0), 15, MID)
     solution = solve_views(cell.views, SolveOptions(working_distance_m=0.5))
     assert (np.linalg.eigvalsh(solution.covariance) > 0).all()
-    assert solution.working_distance_m == 0.5
+    assert solution.judgement.figures.working_distance_m == 0.5
     rng = np.random.default_rng(1)
     deltas = rng.multivariate_normal(np.zeros(6), solution.covariance, size=4000)
     point = np.array([0, 0, 0.5, 1.0])
     moved = (perturb(solution.matrix, deltas) @ point)[:, :3] - (solution.matrix @ point)[:3]
-    assert solution.predicted_error_m == pytest.approx(np.sqrt((moved**2).sum(axis=1).mean()), rel=0.05)
-    assert solution.observability.weakest_text
-    assert 0 < solution.observability.axis_spread <= 1
+    rms_mm = 1e3 * np.sqrt((moved**2).sum(axis=1).mean())
+    assert solution.judgement.figures.predicted_error_mm == pytest.approx(rms_mm, rel=0.05)
+    assert solution.judgement.observability.weakest_text
+    assert 0 < solution.judgement.observability.axis_spread <= 1

@@ -37,8 +37,12 @@ def test_no_good_view_of_a_clean_cell_is_rejected_or_doubted(mount):
         shape = tuple(np.random.default_rng(seed).normal(size=5) * [0.003, 0.003, 5e-4, 5e-4, 5e-4])
         views = real_cell(np.random.default_rng(seed), 15, noise, mount=mount, shape=shape).views
         solution = solve_views(views, QUICK)
-        assert (solution.rejected, solution.suspects, len(solution.used)) == ((), {}, 15)
-        assert np.mean(list(solution.weights.values())) > 0.8
+        assert (
+            solution.evidence.views.rejected,
+            solution.evidence.suspects,
+            len(solution.evidence.views.used),
+        ) == ([], {}, 15)
+        assert np.mean(list(solution.evidence.weights.values())) > 0.8
 
 
 @MOUNTS
@@ -49,9 +53,12 @@ def test_swapped_poses_are_named_with_the_partner(mount):
     views = with_flange(c.views, flange)
     numbered = replace(views, views=tuple(replace(v, index=3 * v.index + 2) for v in views))
     solution = solve_views(numbered, QUICK)
-    assert [(r.index, r.kind) for r in solution.rejected] == [(14, "wrong-pose"), (35, "wrong-pose")]
-    assert [r.belongs_to for r in solution.rejected] == [35, 14]
-    assert set(solution.weights) == set(range(2, 62, 3)), "numbers of the session, not places"
+    assert [(r.index, r.kind) for r in solution.evidence.views.rejected] == [
+        (14, "wrong-pose"),
+        (35, "wrong-pose"),
+    ]
+    assert [r.belongs_to for r in solution.evidence.views.rejected] == [35, 14]
+    assert set(solution.evidence.weights) == set(range(2, 62, 3)), "numbers of the session, not places"
     assert inside(solution, c.X)
 
 
@@ -60,7 +67,7 @@ def test_a_pose_that_was_copied_is_no_swap():
     c = cell()
     flange = c.views.base_from_flange
     flange[4] = flange[11]
-    (rejected,) = solve_views(with_flange(c.views, flange), QUICK).rejected
+    (rejected,) = solve_views(with_flange(c.views, flange), QUICK).evidence.views.rejected
     assert (rejected.index, rejected.kind) == (4, "inconsistent")
 
 
@@ -72,7 +79,7 @@ def test_one_wrong_number_is_named_with_axis_and_size(mount, number, size):
     c = make_cell(np.random.default_rng(3), 14, MID, mount=mount)
     slip = size * np.eye(6)[number]
     solution = solve_views(nudged(c.views, [7], slip[None]), QUICK)
-    (rejected,) = solution.rejected
+    (rejected,) = solution.evidence.views.rejected
     assert (rejected.index, rejected.kind, rejected.wrong_number) == (7, "wrong-number", number)
     assert rejected.slip == pytest.approx(size, abs=5 * SIGMA[number]), "recorded minus true"
     assert inside(solution, c.X)
@@ -84,7 +91,7 @@ def test_one_wrong_number_is_named_with_axis_and_size(mount, number, size):
 def test_a_pose_wrong_in_all_its_numbers_has_no_named_cause():
     c = cell()
     slip = np.array([[0.02, 0.03, -0.01, 0.02, 0.05, 0.04]])
-    (rejected,) = solve_views(nudged(c.views, [7], slip), QUICK).rejected
+    (rejected,) = solve_views(nudged(c.views, [7], slip), QUICK).evidence.views.rejected
     assert (rejected.index, rejected.kind, rejected.wrong_number) == (7, "inconsistent", None)
 
 
@@ -93,10 +100,12 @@ def test_the_farther_off_a_view_the_less_it_counts_and_doubt_is_said():
     weights, states = [], []
     for size in np.arange(0.0, 15.0, 3.0):
         solution = solve_views(nudged(c.views, [7], size * SIGMA[None]), QUICK)
-        weights.append(solution.weights[7])
-        rejected, doubted = 7 not in solution.used, 7 in solution.suspects
+        weights.append(solution.evidence.weights[7])
+        rejected, doubted = 7 not in solution.evidence.views.used, 7 in solution.evidence.suspects
         assert not (rejected and doubted)
-        assert ("suspect-views" in {remark.code for remark in solution.warnings}) == bool(solution.suspects)
+        assert ("suspect-views" in {remark.code for remark in solution.judgement.warnings}) == bool(
+            solution.evidence.suspects
+        )
         states.append("bad" if rejected else "in doubt" if doubted else "good")
     assert states[0] == "good" and "in doubt" in states
     assert weights[0] > 0.8 and weights[-1] < 0.2
@@ -110,7 +119,7 @@ def test_shuffled_poses_cost_hardly_more_than_their_views(share):
     flange = c.views.base_from_flange
     flange[bad] = flange[np.roll(bad, 1)]
     solution = solve_views(with_flange(c.views, flange), QUICK)
-    assert not set(bad) & set(solution.used)
+    assert not set(bad) & set(solution.evidence.views.used)
     oracle = solve_views(c.views.select([i for i in range(25) if i not in set(bad)]), QUICK)
     assert error_mm_deg(solution.matrix, c.X)[0] < 1.15 * error_mm_deg(oracle.matrix, c.X)[0]
     gates = {gate.name: gate.passed for gate in judge(solution)}
@@ -140,6 +149,10 @@ def test_views_without_corners_have_only_a_robot():
     flange = empty.base_from_flange
     flange[4] = flange[5]
     solution = solve_views(with_flange(empty, flange), QUICK)
-    assert "no-corners" in {remark.code for remark in solution.warnings}
-    assert [r.index for r in solution.rejected] == [4]
-    assert solution.residual_px == {} and solution.board is None and solution.lens_finding is None
+    assert "no-corners" in {remark.code for remark in solution.judgement.warnings}
+    assert [r.index for r in solution.evidence.views.rejected] == [4]
+    assert (
+        solution.evidence.rms_px == {}
+        and solution.fit.board is None
+        and solution.judgement.lens_finding is None
+    )

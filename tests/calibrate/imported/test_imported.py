@@ -425,7 +425,7 @@ def test_moveits_own_pairs_give_what_its_test_expects(tmp_path: Path) -> None:
     assert call(main, "import", MOVEIT, "-o", rec, "--mount", "eye-to-hand").returncode == 0
     solution = solve_recording(rec).solution
     np.testing.assert_allclose(solution.matrix[:3, 3], [0.659, -0.249, 0.830], rtol=0.01)
-    assert solution.certificate.certified
+    assert solution.judgement.figures.certificate.certified
 
 
 @pytest.mark.parametrize("counts", [(8, 8), (12, 6), (6, 14)])

@@ -357,5 +357,5 @@ def test_pairs_of_a_camera_whose_axes_are_not_optical_are_solved(
     optical = solve_views(ViewSet.from_poses(mount, flange, replace(cell, axes="optical").truth[1]))
     turned = pose(np.array(OPTICAL_FROM_AXES[axes]), np.zeros(3))
     np.testing.assert_allclose(
-        solved.parent_from_child.matrix, optical.parent_from_child.matrix @ turned, atol=1e-4
+        solved.fit.parent_from_child.matrix, optical.fit.parent_from_child.matrix @ turned, atol=1e-4
     )

@@ -16,34 +16,62 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solution import Explanation, Finding, Reading, Solution
 from calibrate.pipeline.gates import GateLimits, judge
 from calibrate.pipeline.job import SolvedRecording
-from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark
+from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark, ViewQuality, ViewWeight
 from tests.codes import raises
 
 CLOCK_S = 0.001
 DEFAULTS = {name: limit for name, limit in msgspec.structs.asdict(GateLimits()).items() if limit is not None}
 
 
+def altered(
+    solution: Solution,
+    *,
+    fit: dict[str, object] | None = None,
+    figures: dict[str, object] | None = None,
+    judgement: dict[str, object] | None = None,
+    evidence: dict[str, object] | None = None,
+    views: dict[str, object] | None = None,
+) -> Solution:
+    """The solution with other values of these fields of its parts."""
+    judged = solution.judgement
+    shown = solution.evidence
+    return replace(
+        solution,
+        fit=replace(solution.fit, **fit or {}),
+        judgement=replace(
+            judged, figures=msgspec.structs.replace(judged.figures, **figures or {}), **judgement or {}
+        ),
+        evidence=replace(shown, views=msgspec.structs.replace(shown.views, **views or {}), **evidence or {}),
+    )
+
+
+def weighing(solution: Solution, weight: float) -> list[ViewWeight]:
+    return [ViewWeight(index, weight) for index in solution.evidence.views.used]
+
+
 @pytest.fixture
 def solution(solved_real: SolvedRecording) -> Solution:
     """One that every gate lets through: the figure of a new gate gets a good value here."""
     found = solved_real.solution
-    holdout = HoldoutScore(0.0005, 0.001, [0.0005], [0.001], [(0, 1)], 12)
-    noise = MeasurementNoise(0.1, 0.0001, 0.0002)
-    return replace(
+    seen = replace(found.judgement.observability, largest_angle_rad=1.2, axis_spread=0.6)
+    return altered(
         found,
-        holdout=holdout,
-        noise=noise,
-        coverage=0.6,
-        lens_estimated=True,
-        weights=dict.fromkeys(found.used, 1.0),
-        session=Explanation(Reading.AS_RECORDED, 0.0),
-        cross_validation=CrossValidation(0.5, 0.06, 0.4, 5, 1.5),
-        lens_finding=Finding(2.0, 0.0001, 0.0005),
-        board_finding=Finding(2.0, 0.0001, 0.0005),
-        predicted_error_m=0.0005,
-        working_distance_m=0.5,
-        residual_px=dict.fromkeys(found.used, 0.2),
-        observability=replace(found.observability, largest_angle_rad=1.2, axis_spread=0.6),
+        fit={"noise": MeasurementNoise(0.1, 0.0001, 0.0002), "lens_estimated": True},
+        figures={
+            "holdout": HoldoutScore(0.0005, 0.001, [0.0005], [0.001], [(0, 1)], 12),
+            "cross_validation": CrossValidation(0.5, 0.06, 0.4, 5, 1.5),
+            "predicted_error_mm": 0.5,
+            "working_distance_m": 0.5,
+        },
+        judgement={
+            "coverage": 0.6,
+            "session": Explanation(Reading.AS_RECORDED, 0.0),
+            "lens_finding": Finding(2.0, 0.0001, 0.0005),
+            "board_finding": Finding(2.0, 0.0001, 0.0005),
+            "observability": seen,
+        },
+        evidence={"residuals": tuple(ViewQuality(i, 0.2) for i in found.evidence.views.used)},
+        views={"weights": weighing(found, 1.0)},
     )
 
 
@@ -59,24 +87,33 @@ def test_a_good_solution_passes_every_gate(solution: Solution) -> None:
 
 def spoiled(solution: Solution, name: str) -> tuple[Solution, float]:
     """Solution and bound of the clocks that close this gate alone: a new gate gets a bad figure here."""
-    seen, folds = solution.observability, solution.cross_validation
+    seen = solution.judgement.observability
+    figures = solution.judgement.figures
     other = Explanation(Reading.SHIFTED, 90.0, 1)
+    pull = Finding(8.0, 0.0011, 0.0005)
     changed = {
-        "views": replace(solution, used=solution.used[:5]),
-        "arm": replace(solution, without_arm=True),
-        "rotation_deg": replace(solution, observability=replace(seen, largest_angle_rad=0.2)),
-        "axis_spread": replace(solution, observability=replace(seen, axis_spread=0.01)),
-        "session": replace(solution, session=other, warnings=(Remark(other.reading.value, "Move them."),)),
-        "weight": replace(solution, weights=dict.fromkeys(solution.used, 0.79)),
-        "cross_validation": replace(solution, cross_validation=replace(folds, rms_mm=0.61)),
-        "lens_pull": replace(solution, lens_finding=Finding(8.0, 0.0011, 0.0005)),
-        "board_pull": replace(solution, board_finding=Finding(8.0, 0.0011, 0.0005)),
-        "view_rms_px": replace(solution, residual_px={3: 9.0}),
-        "holdout_share": replace(solution, holdout=msgspec.structs.replace(solution.holdout, e_t_m=0.02)),
-        "predicted_error_m": replace(solution, predicted_error_m=0.003),
-        "robot_error_m": replace(solution, noise=MeasurementNoise(0.1, 0.01, 0.0)),
-        "robot_error_deg": replace(solution, noise=MeasurementNoise(0.1, 0.0, 0.02)),
-        "coverage": replace(solution, coverage=0.05),
+        "views": altered(solution, views={"used": solution.evidence.views.used[:5]}),
+        "arm": altered(solution, judgement={"without_arm": True}),
+        "rotation_deg": altered(solution, judgement={"observability": replace(seen, largest_angle_rad=0.2)}),
+        "axis_spread": altered(solution, judgement={"observability": replace(seen, axis_spread=0.01)}),
+        "session": altered(
+            solution,
+            judgement={"session": other, "warnings": (Remark(other.reading.value, "Move them."),)},
+        ),
+        "weight": altered(solution, views={"weights": weighing(solution, 0.79)}),
+        "cross_validation": altered(
+            solution, figures={"cross_validation": replace(figures.cross_validation, rms_mm=0.61)}
+        ),
+        "lens_pull": altered(solution, judgement={"lens_finding": pull}),
+        "board_pull": altered(solution, judgement={"board_finding": pull}),
+        "view_rms_px": altered(solution, evidence={"residuals": (ViewQuality(3, 9.0),)}),
+        "holdout_share": altered(
+            solution, figures={"holdout": msgspec.structs.replace(figures.holdout, e_t_m=0.02)}
+        ),
+        "predicted_error_m": altered(solution, figures={"predicted_error_mm": 3.0}),
+        "robot_error_m": altered(solution, fit={"noise": MeasurementNoise(0.1, 0.01, 0.0)}),
+        "robot_error_deg": altered(solution, fit={"noise": MeasurementNoise(0.1, 0.0, 0.02)}),
+        "coverage": altered(solution, judgement={"coverage": 0.05}),
     }
     return changed.get(name, solution), 0.05 if name == "clock_bound_s" else CLOCK_S
 
@@ -115,17 +152,21 @@ def test_a_statement_closes_its_gate_by_what_its_tolerance_leaves_unexplained(
     solution: Solution, sigmas: float, pull_m: float, closed: bool
 ) -> None:
     for name in ("lens", "board"):
-        told = replace(solution, **{f"{name}_finding": Finding(sigmas, pull_m, 0.0005)})
+        told = altered(solution, judgement={f"{name}_finding": Finding(sigmas, pull_m, 0.0005)})
         assert failed(judge(told, None, CLOCK_S)) == [f"{name}_pull"] * closed
 
 
 def test_the_certificate_informs_and_closes_nothing(solution: Solution) -> None:
-    bad = replace(solution.certificate, certified=False, distance_sigma=40.0)
-    assert failed(judge(replace(solution, certificate=bad), None, CLOCK_S)) == []
+    bad = replace(solution.judgement.figures.certificate, certified=False, distance_sigma=40.0)
+    assert failed(judge(altered(solution, figures={"certificate": bad}), None, CLOCK_S)) == []
 
 
 def test_what_cannot_be_judged_is_left_out(solution: Solution) -> None:
-    bare = replace(solution, noise=None, holdout=None, lens_estimated=False, cross_validation=None)
+    bare = altered(
+        solution,
+        fit={"noise": None, "lens_estimated": False},
+        figures={"holdout": None, "cross_validation": None},
+    )
     judged = {gate.name for gate in judge(bare)}
     assert judged & {"views", "holdout_share", "cross_validation", "coverage", "robot_error_m"} == {"views"}
 
@@ -153,7 +194,7 @@ def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) ->
 def test_an_error_without_the_arm_s_own_is_a_warning_unless_the_integrator_says_more(
     solution: Solution,
 ) -> None:
-    gates = judge(replace(solution, without_arm=True), None, CLOCK_S)
+    gates = judge(altered(solution, judgement={"without_arm": True}), None, CLOCK_S)
     assert failed(gates) == []
     assert [gate.name for gate in gates if gate.remedy] == ["arm"]
     assert all(gate.narrow for gate in gates if gate.remedy)
@@ -172,9 +213,11 @@ def test_the_predicted_error_says_whether_the_arm_s_own_is_in_it(solved_real: So
 
 def test_the_pose_to_retake_is_numbered_as_on_the_screen(solution: Solution) -> None:
     """From 1, as `station retake` takes it."""
-    bad = solution.used[3]
-    residual_px = {**solution.residual_px, bad: 9.0}
-    gates = judge(replace(solution, residual_px=residual_px), None, CLOCK_S)
+    bad = solution.evidence.views.used[3]
+    residuals = tuple(
+        ViewQuality(one.index, 9.0 if one.index == bad else one.rms_px) for one in solution.evidence.residuals
+    )
+    gates = judge(altered(solution, evidence={"residuals": residuals}), None, CLOCK_S)
     (gate,) = (gate for gate in gates if not gate.passed)
     assert (gate.name, gate.value, gate.unit) == ("view_rms_px", 9.0, "px")
     assert f"pose {bad + 1}" in gate.remedy

@@ -64,13 +64,13 @@ def test_a_symmetric_board_solves_by_the_robots_motion(tmp_path: Path) -> None:
 
 def test_a_wrong_square_size_is_found_and_said(real_session_file: Path, solved_real: SolvedRecording) -> None:
     job = solve_recording(real_session_file, JobOptions(square_m=0.026))
-    session = job.solution.session
+    session = job.solution.judgement.session
     assert session.reading is Reading.SQUARE_SIZE
     assert 0.026 * session.factor == pytest.approx(0.025, rel=0.005)
     assert {"session", "board_pull"} & {gate.name for gate in job.gates if not gate.passed}
     right = solved_real
     assert all(gate.passed for gate in right.gates if gate.name in ("session", "board_pull"))
-    assert abs(right.solution.board.scale) < 4 * right.solution.board.sigma[0]
+    assert abs(right.solution.fit.board.scale) < 4 * right.solution.fit.board.sigma[0]
 
 
 def test_another_board_or_lens_can_be_tried_on_the_old_pictures(
@@ -138,9 +138,9 @@ def solved_set(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Sol
 def test_other_peoples_recordings_solve(datasets: Path, solved_set: SolveSet, name: str) -> None:
     fewest, spread_mm, truth_mm = DATASETS[name]
     job = solved_set(datasets / name)
-    assert len(job.solution.used) >= fewest
-    assert job.solution.board_spread_m * 1e3 < spread_mm
-    assert job.solution.certificate.certified
+    assert len(job.solution.evidence.views.used) >= fewest
+    assert job.solution.judgement.figures.board_spread_mm < spread_mm
+    assert job.solution.judgement.figures.certificate.certified
     if truth_mm is not None:
         truth = np.array(yaml.safe_load((datasets / name / "truth.yaml").read_text())["matrix"])
         assert error_mm_deg(job.solution.matrix, truth)[0] < truth_mm
@@ -160,7 +160,7 @@ def test_a_slip_of_typing_in_a_real_list_of_poses_is_named_and_costs_one_number(
         solved_set(folder / name).solution
         for folder, name in ((tmp_path, "typed"), (datasets, "rendered-truth"))
     )
-    (rejected,) = typed.rejected
+    (rejected,) = typed.evidence.views.rejected
     assert rejected.index == 5
     assert (rejected.kind, rejected.wrong_number) == ("wrong-number", 1)
     assert error_mm_deg(typed.matrix, right.matrix)[0] < 0.05

@@ -61,7 +61,7 @@ def test_a_folder_and_a_recording_are_read_as_arrays(solved: SolvedRecording, tm
         tuple(map(tuple, T)) for T in told.base_from_flange.tolist()
     ]
     np.testing.assert_array_equal(solved.X, solved.solution.matrix)
-    for index, rms_px in solved.solution.residual_px.items():
+    for index, rms_px in solved.solution.evidence.rms_px.items():
         assert np.sqrt(np.square(solved.residuals_px[index]).sum(axis=1).mean()) < 3 * rms_px + 1
     assert solved.plot()._repr_png_().startswith(b"\x89PNG")
 

@@ -105,7 +105,7 @@ def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Record
         (7, "unreadable-picture"),
     ]
     assert [rejected.index for rejected in job.calibration.views.rejected] == [3, 7]
-    page, largest_px = report_page(job), max(job.solution.residual_px.values())
+    page, largest_px = report_page(job), max(job.solution.evidence.rms_px.values())
     assert loaded.without_board[0].reason in page
     assert page.count(" px</title></rect>") == 6
     assert re.search(rf'class="largest" \S+ y="0" \S+ height="{largest_px:.4g}"', page)

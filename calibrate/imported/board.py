@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -21,6 +20,7 @@ from calibrate.boards.grids import count_circles, seen_size
 from calibrate.boards.markers import marker_detector
 from calibrate.boards.model import board_points, usual_markers
 from calibrate.errors import CalibrationError
+from calibrate.imported.described import Described, described
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.views.view_set import NO_CORNERS, BoardView, ViewSet
@@ -72,6 +72,8 @@ class Seen:
     """Evidence for it."""
     another: tuple[BoardSpec, int] | None = None
     """Another board, and how many of the images that do not show this one show it."""
+    size_told: bool = True
+    """Its columns and rows are told; else they are as the images show them."""
 
 
 def told_boards(table: Table) -> Iterator[Seen]:
@@ -119,7 +121,9 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
     if given:
         likely = _likely([(given, None)], few, progress)
     else:
-        likely = _likely(chain(_described(held.facts), _shown(greys)), few, progress)
+        told = described(held.facts)
+        as_told = ((board, None) for board in told.boards)
+        likely = _likely(chain(as_told, _shown(greys, told)), few, progress)
         if not any(each.often and (each.known or each.board.kind is BoardKind.CHESSBOARD) for each in likely):
             likely += _likely(_shown_circles(greys), few, progress)
     for each in sorted(likely, key=_Tried.rank)[:2]:
@@ -145,7 +149,17 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
             candidates = {path: candidate_poses(view, camera[0], board) for path, view in views.items()}
             without = [small[path] for path in images if path not in views]
             another = _another(board, [tried.board for tried in likely], without)
-            return Seen(board, known, views, candidates, *camera, len(images), greys, another=another)
+            return Seen(
+                board,
+                known,
+                views,
+                candidates,
+                *camera,
+                len(images),
+                greys,
+                another=another,
+                size_told=each.size_told,
+            )
     return None
 
 
@@ -189,26 +203,32 @@ class _Tried:
 
     board: BoardSpec
     known: bool
-    """Its size is told."""
+    """The side of its squares is told; else it is a guess."""
+    size_told: bool
+    """Its columns and rows are told; else an image suggested them."""
     corners: int
-    """That were seen in all of them."""
+    """Seen in all of these images together."""
     often: bool
-    """Half of them show it."""
+    """At least half of them show it."""
 
-    def rank(self) -> tuple[bool, int]:
-        """What is described and seen comes first, then who shows more corners."""
-        return not (self.known and self.often), -self.corners
+    def rank(self) -> tuple[int, int]:
+        """Sort key of the likeliest board first: one that is often seen and whose squares are told, then the
+        one of which most corners are seen."""
+        told_and_seen = self.known and self.often
+        return (0 if told_and_seen else 1), -self.corners
 
 
 def _likely(
     boards: Iterable[tuple[BoardSpec, Grey | None]], images: list[Grey], progress: Progress
 ) -> list[_Tried]:
-    """Try boards at a glance, until one whose size is told is often seen. One that an image suggested must
-    first be found in that one."""
+    """Try boards at a glance, until one whose squares are told is often seen.
+
+    One that an image suggested must first be found in that one.
+    """
     tried: list[_Tried] = []
     for n, (each, shown) in enumerate(boards):
         known = each.square_m > 0
-        board = each if known else msgspec.structs.replace(each, square_m=GUESSED_M)
+        board = each if known else _guessed(each)
         progress(n, n + 1, f"trying a {board.kind.value} {board.columns}×{board.rows}")
         part = shown is not None and any(
             _is_part(board, larger.board) for larger in tried if not larger.known
@@ -220,10 +240,17 @@ def _likely(
         except CalibrationError:
             continue
         often = 2 * sum(found.found for found in seen) >= len(seen)
-        tried.append(_Tried(board, known, sum(found.corners for found in seen), often))
+        corners = sum(found.corners for found in seen)
+        tried.append(_Tried(board, known, shown is None, corners, often))
         if often and known:
             break
     return tried
+
+
+def _guessed(board: BoardSpec) -> BoardSpec:
+    """The board with squares of a guessed length, and the markers that such squares usually have."""
+    marker_m = usual_markers(board.kind, GUESSED_M)[0]
+    return msgspec.structs.replace(board, square_m=GUESSED_M, marker_m=marker_m)
 
 
 def _is_part(board: BoardSpec, larger: BoardSpec) -> bool:
@@ -245,73 +272,9 @@ def _camera(
     return None if own is None else (own, False)
 
 
-_ACROSS = frozenset({"columns", "column", "cols", "col", "ncols", "width", "w", "x", "nx", "horizontal"})
-_DOWN = frozenset({"rows", "row", "nrows", "height", "h", "y", "ny", "vertical"})
-"""Words of keys that tell a board's two sides."""
-_ONE_OF_MANY = frozenset({"square", "tile", "marker", "tag"})
-_SQUARE = re.compile(r"square|tile|spacing|chessboard_dim|center_dist|tag_size", re.I)
-_MARKER = re.compile(r"(aruco|len|size|side).*marker|marker.*(dim|size|len|side)", re.I)
-
-
-def _described(facts: dict[str, Any]) -> Iterator[tuple[BoardSpec, None]]:
-    """Boards that the files describe, likeliest first."""
-    text = " ".join(f"{key} {value}" for key, value in facts.items())
-    sides = _sides(facts)
-    counts = {key for both in sides for key in both}
-
-    def length(wanted: re.Pattern[str]) -> float:
-        for key, value in facts.items():
-            if key not in counts and wanted.search(key) and isinstance(value, (int, float)) and value > 0:
-                return value / 1000 if "mm" in key or value > 1 else float(value)
-        mm = re.search(rf"(?:{wanted.pattern})\D{{0,20}}?(\d+\.?\d*) ?mm|^\D*(\d+\.?\d*) ?mm\b", text, re.I)
-        return float(mm[mm.lastindex or 1]) / 1000 if mm and wanted is _SQUARE else 0.0
-
-    square_m, marker_m = length(_SQUARE), length(_MARKER)
-    sizes = [
-        (int(v[0]), int(v[1])) for k, v in facts.items() if re.search("pattern|board|size", k) and _two(v)
-    ]
-    sizes += [(int(facts[across]), int(facts[down])) for across, down in sides]
-    sizes += [(int(a), int(b)) for a, b in re.findall(r"\b(\d{1,2}) ?[x×*] ?(\d{1,2})\b", text)]
-    number = next((v for k, v in facts.items() if "dictionary" in k), None)
-    names = {getattr(cv2.aruco, name): name for name in dir(cv2.aruco) if re.match(r"DICT_\d", name)}
-    dictionary = number if isinstance(number, str) else names.get(number)
-    for size in dict.fromkeys(size for size in sizes if min(size) >= 1 and max(size) < 60):
-        if dictionary and size == (1, 1):
-            for tag in range(4):
-                yield BoardSpec(BoardKind.ARUCO, 1, 1, marker_m, dictionary=dictionary, tag_id=tag), None
-        elif dictionary:
-            for legacy in (False, True):
-                marker = marker_m or usual_markers(BoardKind.CHARUCO, square_m)[0]
-                yield BoardSpec(BoardKind.CHARUCO, *size, square_m, marker, dictionary, legacy), None
-        elif "circle" in text.lower():
-            kinds = [BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES]
-            yield from ((BoardSpec(kind, *size, square_m), None) for kind in kinds)
-        else:
-            for less in (0, 1):  # squares may have been counted
-                yield BoardSpec(BoardKind.CHESSBOARD, size[0] - less, size[1] - less, square_m), None
-
-
-def _sides(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    """The keys of columns and of rows that count a board's two sides: they differ by one word, as board_width
-    and board_height do. Those with more words come first.
-
-    Corners per row are columns. A square's own width is a length.
-    """
-    sides: dict[tuple[str, ...], dict[bool, str]] = {}
-    for key, value in facts.items():
-        words = re.findall(r"[a-z]+", key)
-        is_count = isinstance(value, (int, float)) and float(value).is_integer()
-        turned = "per" in words
-        for word in words if is_count and _ONE_OF_MANY.isdisjoint(words) else ():
-            if word in _ACROSS | _DOWN:
-                alike = tuple(other for other in words if other != word)
-                sides.setdefault(alike, {}).setdefault((word in _ACROSS) != turned, key)
-    both = [alike for alike, each in sides.items() if len(each) == len((True, False))]
-    return [(sides[alike][True], sides[alike][False]) for alike in sorted(both, key=len, reverse=True)]
-
-
-def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
-    """Boards of unknown size that images suggest: a tag that most of a few show, and chessboards."""
+def _shown(greys: list[Grey], told: Described) -> Iterator[tuple[BoardSpec, Grey]]:
+    """Boards that images suggest, with the lengths that are told: a tag that most of a few show, and
+    chessboards."""
     few = greys[:: max(1, len(greys) // _TRIED)]
     for dictionary in _DICTIONARIES:
         detector = marker_detector(dictionary, 1)
@@ -321,13 +284,13 @@ def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
             if 2 * count > len(few) and len(tags) < _TRIED:
                 kind = BoardKind.APRIL_TAG if "APRIL" in dictionary else BoardKind.ARUCO
                 grey = next(g for g, seen in zip(few, ids, strict=True) if seen is not None and tag in seen)
-                yield BoardSpec(kind, dictionary=dictionary, tag_id=tag), grey
+                yield BoardSpec(kind, square_m=told.tag_m, dictionary=dictionary, tag_id=tag), grey
     sizes = {size: grey for grey in greys[:: max(1, len(greys) // (2 * _TRIED))] if (size := seen_size(grey))}
     if sizes:  # one image may show a part only: the largest sides of all
         whole = max(side for side, _ in sizes), max(side for _, side in sizes)
         sizes.setdefault(whole, sizes[max(sizes, key=lambda size: size[0] * size[1])])
     for size in sorted(sizes, key=lambda size: -size[0] * size[1])[: _TRIED + 2]:
-        yield BoardSpec(BoardKind.CHESSBOARD, *size), sizes[size]
+        yield BoardSpec(BoardKind.CHESSBOARD, *size, told.square_m), sizes[size]
 
 
 def _shown_circles(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
@@ -345,7 +308,3 @@ def _shown_circles(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
 _DICTIONARIES = [
     f"DICT_{name}" for name in ["4X4_1000", "5X5_1000", "6X6_1000", "ARUCO_ORIGINAL", "APRILTAG_36H11"]
 ]
-
-
-def _two(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(float(v).is_integer() for v in value)

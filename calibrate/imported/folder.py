@@ -435,7 +435,7 @@ def _board(best: TableReading) -> tuple[BoardSpec, str]:
     """
     board = best.seen.board
     if best.seen.square_known:
-        return board, "as described"
+        return board, "as described" if best.seen.size_told else "square as described, size as it is seen"
     factor, sigma = guessed_size(best)
     square_mm = 1e3 * factor * GUESSED_M
     sigma_mm = 1e3 * sigma * GUESSED_M

@@ -217,7 +217,7 @@ def look(
             if (row := _pose(node.value) or _half(node)) is not None:
                 numbers, rotation, half = row
                 place = (*_numbers_in(name), *node.place)
-                key = ".".join(node.keys), rotation, half, str(len(numbers))
+                key = ".".join(filter(None, node.keys)), rotation, half, str(len(numbers))
                 is_told = file in (path, *path.parents)
                 told[key].append(_Row(numbers, node.image, place, is_told, alike, node.labels))
         for (named, *form), each in told.items():  # files of one row each make a table together
@@ -598,12 +598,22 @@ def _half_of(word: str) -> str | None:
     return next((half for half, (words, _) in _HALVES.items() if words.fullmatch(word.strip("#"))), None)
 
 
+def _fact_key(keys: tuple[str, ...]) -> str:
+    """The last key in lower case, words parted by `_`.
+
+    The key above it stands before it where only that one speaks of a board: the `size` in a `chessboard` is
+    chessboard_size.
+    """
+    above, last = ("", "", *(re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key).lower() for key in keys))[-2:]
+    return f"{above}_{last}" if _OF_BOARDS.search(above) and not _OF_BOARDS.search(last) else last
+
+
 def _facts(node: _Node, found: Contents) -> bool:
     """Note a camera's matrix, by its form, and what describes a board; returns whether it seems to be so."""
     numbers = _flat(node.value) if isinstance(node.value, (list, dict)) else None
     if numbers and not np.isfinite(numbers).all():
         return False
-    key = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", node.keys[-1]).lower() if node.keys else ""
+    key = _fact_key(node.keys)
     tells = bool(_OF_BOARDS.search(key))
     if numbers and len(numbers) >= 9:
         K = np.array(numbers[:9]).reshape(3, 3)

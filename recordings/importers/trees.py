@@ -42,6 +42,16 @@ DATES = re.compile(rf"(?<![\w.]){_DAY}{_BEHIND_A_DAY}{_ZONE}(?![\w.])|(?<![\w.:]
 """Dates and times of day, which are no numbers of a pose."""
 _CELLS = re.compile(r"\s*[;\t]\s*|\s+")
 _WITH_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?|[-+]?\d+")
+_COMMENT = ("#", "%")
+_BOARD_IN_WORDS = re.compile(
+    r"(?=.*(?:board|chess|check|square|tile|pattern|charuco|circle|marker|grid))"
+    r"(?=.*\d ?(?:[x×*] ?\d|(?:mm|cm|m|inch)\b))",
+    re.IGNORECASE,
+)
+_SENTENCE = 200
+"""Most letters of a line that tells of a board in words."""
+_MOST_OF_A_BOARD = 4
+"""Most numbers of such a line: two sides, a square and a marker."""
 _SAMPLE_BYTES = 2000
 _MOSTLY = 0.4
 POSE_SIZES = (6, 7, 12, 16, 8, 13, 17)
@@ -171,9 +181,33 @@ def _of_xml(element: ElementTree.Element) -> Any:
 def _of_text(text: str) -> Any:
     """Lines with as many numbers, and the same words, are rows; four of four numbers are a matrix.
 
-    Lines without words have those of the heading above them.
+    Lines without words have those of the heading above them. Lines that tell of a board stay texts.
     """
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(("#", "%"))]
+    said: dict[str, str] = {}
+    lines: list[str] = []
+    for line in filter(str.strip, text.splitlines()):
+        if told := _of_a_board(line):
+            said.setdefault(*told)
+        elif not line.lstrip().startswith(_COMMENT):
+            lines.append(line)
+    rows = _rows_of(lines)
+    if not said:
+        return rows
+    return {**(rows if isinstance(rows, dict) else {"": rows} if rows else {}), **said}
+
+
+def _of_a_board(line: str) -> tuple[str, str] | None:
+    """(key, text) of a line, perhaps a comment, that tells the size of a board or of its squares in words."""
+    plain = line.strip().lstrip("".join(_COMMENT)).strip()
+    if len(plain) > _SENTENCE or not _BOARD_IN_WORDS.match(plain) or IMAGE.search(plain):
+        return None
+    if len(_numbers(plain)) > _MOST_OF_A_BOARD:
+        return None
+    key, _, value = plain.partition(":" if ":" in plain else "=")
+    return (key.strip(), value.strip()) if value.strip() else (plain, plain)
+
+
+def _rows_of(lines: list[str]) -> Any:
     header = re.split(r"[,;\t]", lines[0]) if lines else []
     header = [name.strip().strip("\"'") for name in header]
     if len(header) >= 6 and not _NUMBER.search(lines[0]):

@@ -19,11 +19,13 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from calibrate.imported import Given, believe, board
+from calibrate.imported.described import described
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
 from recordings.geometry import pose, rotation_exp
 from recordings.importers.tables import look
 from recordings.reader import open_recording
+from recordings.schema.messages import BoardKind
 from tests.calibrate.pose_files import euler, quaternions
 from tests.calibrate.sessions import PAPER_BOARD, X_TRUE, Scene, write_session
 from tests.codes import raises
@@ -684,6 +686,16 @@ DESCRIBED = {
     "num.yaml": "numCornersHorizontal: 7\nnumCornersVertical: 6\nsquareMm: 25\n",
     "squares.json": '{"squaresX": 8, "squaresY": 7, "squareLength": 0.025}',
     "checker.yaml": "checkerboardRows: 6\ncheckerboardColumns: 7\ncheckerboardSquareSize: 0.025\n",
+    "nested.json": '{"chessboard": {"cols": 7, "rows": 6, "size": 0.025}}',
+    "nested.yaml": "target:\n  board:\n    width: 7\n    height: 6\n    length: 25\n",
+    "unit.yaml": "pattern: {columns: 7, rows: 6, square_size: 2.5, unit: cm}\n",
+    "list.yaml": "checkerboard: {pattern_size: [7, 6], side: 0.025}\n",
+    "words.txt": "board: 7x6\nsquare 25 mm\n",
+    "words.yaml": "board: 7 x 6 inner corners, squares of 25 mm\n",
+    "equal.txt": "board = 7 × 6\nsquare = 2.5 cm\n",
+    "sentence.txt": "The chessboard has 7x6 corners and 25 mm squares.\n",
+    "comment.txt": "# board 7x6, 25mm\n",
+    "as_typed.yaml": "board: 7x6 25\n",
 }
 
 
@@ -695,6 +707,37 @@ def test_a_board_is_read_as_a_file_describes_it(name: str, shots: Shots, tmp_pat
     board_read = believe(look(tmp_path), Given(mount="eye-in-hand")).dataset.board
     assert (board_read.columns, board_read.rows, board_read.square_m) == (7, 6, 0.025)
     assert not board_read.square_guessed
+
+
+def test_what_is_told_beside_the_poses_is_read_too(shots: Shots, tmp_path: Path) -> None:
+    """Also as a comment above them."""
+    save_images(shots, tmp_path, "images/{n}.png")
+    rows = lines(quaternions(shots.flanges["one"]))
+    for above in ("# board 7x6, squares of 25 mm", "board: 7x6\nsquare: 25 mm"):
+        (tmp_path / "robot.csv").write_text("\n".join([above, *rows]))
+        board_read = believe(look(tmp_path), Given(mount="eye-in-hand")).dataset.board
+        assert (board_read.columns, board_read.rows, board_read.square_m) == (7, 6, 0.025)
+        assert not board_read.square_guessed
+
+
+@pytest.mark.parametrize("told", ["square_size: 0.025\n", "squareMm: 25\n"])
+def test_a_square_is_used_though_nothing_tells_the_boards_size(
+    told: str, shots: Shots, tmp_path: Path
+) -> None:
+    save_images(shots, tmp_path, "images/{n}.png")
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    (tmp_path / "board.yaml").write_text(told)
+    believed = believe(look(tmp_path), Given(mount="eye-in-hand"))
+    board_read = believed.dataset.board
+    assert ({board_read.columns, board_read.rows}, board_read.square_m) == ({7, 6}, 0.025)
+    assert not board_read.square_guessed
+
+
+def test_kalibrs_grid_of_tags_is_read() -> None:
+    told = {"target_type": "aprilgrid", "tag_cols": 6, "tag_rows": 5, "tag_size": 0.088, "tag_spacing": 0.3}
+    (board_read,) = described(told).boards
+    assert (board_read.kind, board_read.columns, board_read.rows) == (BoardKind.APRIL_GRID, 6, 5)
+    assert (board_read.square_m, board_read.marker_m) == (0.088, pytest.approx(0.0264))
 
 
 # ---- what others left

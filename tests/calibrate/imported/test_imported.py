@@ -18,6 +18,7 @@ from calibrate.files import exports
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
 from calibrate.imported import Given, believe, board
+from calibrate.imported.described import described
 from calibrate.lens.pnp import Candidate
 from calibrate.pipeline.job import JobOptions, solve_recording
 from calibrate.report.page import report_page
@@ -73,7 +74,7 @@ def put(
         return folder
 
     def seen(held, given, paths, progress):
-        key = (given, tuple(board._described(held.facts)), len(paths))
+        key = (given, described(held.facts), len(paths))
         if key not in _SEEN:
             _SEEN[key] = board.see_board(held, given, paths, progress)
         found = _SEEN[key]

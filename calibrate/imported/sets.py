@@ -26,10 +26,8 @@ _COMPARED = 3
 """Images of two families that are compared before they are called the same pictures."""
 _MOST_CAMERAS = 4
 """Most cameras whose images differ by a digit of their names."""
-_MADE = re.compile(
-    r"draw|calibrated|overlay|visual|detect|result|undist|depth|corner|(?<![a-z])IR\b|axes", re.I
-)
-"""Names of images that a program painted on, or that another camera took."""
+_MADE = re.compile(r"draw|calibrated|overlay|visual|detect|result|undist|depth|corner|axes", re.I)
+"""Names of images that a program painted on or made. One of infrared is another camera's, not made."""
 _PARTS = re.compile(r"[a-z]+\d*|\d+")
 
 

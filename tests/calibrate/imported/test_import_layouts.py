@@ -431,6 +431,8 @@ CAMERAS = (
     ("left/img_{n}.png", "right/img_{n}.png"),
     ("cam0/{n}.png", "cam1/{n}.png"),
     ("pose_{n}/left.png", "pose_{n}/right.png"),
+    ("pose_{n}/rgb.png", "pose_{n}/ir.png"),
+    ("pose_{n}/color.png", "pose_{n}/IR.png"),
     ("{n}_a.png", "{n}_b.png"),
     ("im_{n}_0.png", "im_{n}_1.png"),
     ("cam_0_img_{n}.png", "cam_1_img_{n}.png"),

@@ -57,10 +57,15 @@ _KUKA = re.compile(rb"DEFDAT|\bE6POS\b|\bE6AXIS\b")
 _RESULT = "a result of a calibration, which is not read"
 _BEGINNING_BYTES = 64 * 1024
 _HALVES = {
-    "position": (re.compile(r"pos|position|trans\w*|tvec|t|xyz|p|location"), (3,)),
-    "rotation": (re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues"), (3, 4, 9)),
+    "position": (re.compile(r"pos|position|trans\w*|tvecs?|t|xyz|p|location"), (3,)),
+    "rotation": (re.compile(r"rot\w*|ori\w*|quat\w*|rvecs?|r|rpy|euler\w*|rodrigues"), (3, 4, 9)),
 }
 """Words of the two halves of a pose that are told apart, and how many numbers each has."""
+_OPENCVS = re.compile(r"(?<![a-z])(?:[rt]_?vecs?|rodrigues)(?![a-z])", re.I)
+"""OpenCV's names of the halves of a pose, of which that of the turn says that it is a rotation vector."""
+_ROTATION_VECTOR = re.compile(rf"{_OPENCVS.pattern}|rot(?:ation)?_?vec(?:tor)?s?(?![a-z])", re.I)
+_HAND_AND_EYE = {"h": "hand", "e": "eye"}
+"""Letters of columns that tell the two sides of a pair, where both are there: h_x … e_qw."""
 _FORM = re.compile(r"m|mm|deg|rad|vec|vector|xyzw|wxyz|matrix|mat|\dx\d|x|angles?")
 """Words of a half's name that tell its unit or form."""
 _COLUMNS = {
@@ -90,6 +95,16 @@ _PART = re.compile(r"(.*?)[_. ]?(q?[xyzw]|r[xyz]|roll|pitch|yaw|[abc]|\d+)")
 """A name of one number among those of a pose: whose pose, and which number."""
 
 
+def whose_of(name: str) -> str:
+    """robot, board or other by the last words of a table's name that say any; empty: none says."""
+    name = re.sub(r"hand_?eye|(?i:(eye|hand)_?(in|to|on)_?(hand|eye))", "", name)
+    for part in reversed(re.split(r"[ /.]", name)):
+        for whose, words in _WHOSE.items():
+            if words.search(part):
+                return whose
+    return ""
+
+
 @dataclass(frozen=True, eq=False)
 class Table:
     """Numbers that may be poses, one row each."""
@@ -110,12 +125,7 @@ class Table:
     @property
     def whose(self) -> str:
         """robot, board or other by its last words that say any; empty: none says."""
-        name = re.sub(r"hand_?eye|(?i:(eye|hand)_?(in|to|on)_?(hand|eye))", "", self.name)
-        for part in reversed(re.split(r"[ /.]", name)):
-            for whose, words in _WHOSE.items():
-                if words.search(part):
-                    return whose
-        return ""
+        return whose_of(self.name)
 
 
 @dataclass
@@ -275,7 +285,12 @@ def _folded(files: list[Path]) -> dict[Path, str]:
 
 
 def _joined(rows: dict[tuple[str, ...], list[_Row]]) -> Iterator[tuple[str, str, list[_Row]]]:
-    """(name, rotation, rows) of whole poses, then of halves named alike but for which half they are."""
+    """(name, rotation, rows) of whole poses, then of halves named alike but for which half they are.
+
+    OpenCV's `rvec` and `tvec` stay in the name of what is the board's, by its name or beside a table that is
+    named the robot's: they tell the direction of its poses.
+    """
+    robot_named = any(whose_of(name) == "robot" for name, *_ in rows)
     halves = defaultdict[tuple[str, int], dict[str, tuple[str, ...]]](dict)
     for key, each in rows.items():
         if key[2]:
@@ -288,11 +303,15 @@ def _joined(rows: dict[tuple[str, ...], list[_Row]]) -> Iterator[tuple[str, str,
         if len(both) == 2:
             at, turn = both["position"], both["rotation"]
             path, _, last = at[0].replace(" ", ".").rpartition(".")
+            above = at[0][: len(path)]
+            is_opencvs = _OPENCVS.fullmatch(last) and turn[1] == "rotvec"
+            is_boards = whose_of(above) == "board" or (robot_named and whose_of(above) == "")
+            keeps_last = "_" in last or (is_opencvs and is_boards)
             for row, other in zip(rows[at], rows[turn], strict=True):
                 row.numbers += other.numbers
                 if len(row.numbers) == 12:  # a matrix has each row's number of the position behind it
                     row.numbers = [row.numbers[k] for k in (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2)]
-            yield at[0] if "_" in last else at[0][: len(path)], turn[1], rows[at]
+            yield at[0] if keeps_last else above, turn[1], rows[at]
 
 
 def _without_count(table: Array) -> Array:
@@ -528,7 +547,9 @@ def _stems(tree: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         part = _PART.fullmatch(_plain_key(str(key))) if len(str(key)) <= _TEXT_LIMIT else None
         if part and part[1] and isinstance(value, (int, float)):
             groups[part[1]][part[2]] = value
-    for stem, parts in groups.items():
+    both = _HAND_AND_EYE if groups.keys() >= _HAND_AND_EYE.keys() else {}
+    for letter, parts in groups.items():
+        stem = both.get(letter, letter)
         yield stem, list(parts.values()) if "".join(parts).isdigit() else parts
 
 
@@ -591,7 +612,15 @@ def _half(node: _Node) -> tuple[list[float], str, str] | None:
     flat = _flat(node.value) if half else None
     if not flat or len(flat) not in _HALVES[half][1] or not np.isfinite(flat).all():
         return None
-    return flat, "xyzw" if isinstance(node.value, dict) and "w" in node.value else "", half
+    return flat, _form_of_half(node, half, len(flat)), half
+
+
+def _form_of_half(node: _Node, half: str, count: int) -> str:
+    """What the key or the parts of half of a pose say of the form of its rotation; empty: nothing."""
+    if isinstance(node.value, dict) and "w" in node.value:
+        return "xyzw"
+    is_vector = half == "rotation" and count == 3 and _ROTATION_VECTOR.search(node.keys[-1])
+    return "rotvec" if is_vector else ""
 
 
 def _half_of(word: str) -> str | None:

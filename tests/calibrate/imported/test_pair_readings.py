@@ -359,3 +359,56 @@ def test_pairs_of_a_camera_whose_axes_are_not_optical_are_solved(
     np.testing.assert_allclose(
         solved.fit.parent_from_child.matrix, optical.fit.parent_from_child.matrix @ turned, atol=1e-4
     )
+
+
+def opencvs_rows(cell: Cell, robot: str, board: str) -> list[dict[str, object]]:
+    flange, C = cell.truth
+    rows: list[dict[str, object]] = []
+    for F, T in zip(flange, C, strict=True):
+        turn = Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist()
+        solved = {"rvec": turn, "tvec": T[:3, 3].tolist()}
+        rows.append({robot: F.tolist(), **({board: solved} if board else solved)})
+    return rows
+
+
+@pytest.mark.parametrize("board", ["target", "board_pose", ""])
+@pytest.mark.parametrize("faces_camera", [False, True])
+def test_opencvs_rvec_and_tvec_are_a_rotation_vector_of_the_board_in_the_camera(
+    board: str, faces_camera: bool, tmp_path: Path
+) -> None:
+    cell = Cell(faces_camera=faces_camera)
+    (tmp_path / "samples.json").write_text(json.dumps(opencvs_rows(cell, "tcp_pose", board)))
+    (table,) = (table for table in look(tmp_path).tables if table.whose == "board")
+    assert table.rotation == "rotvec"
+    assert cell.is_read(believe(look(tmp_path)))
+
+
+@pytest.mark.parametrize("columns", ["rvec_{}", "board_rvec_{}"])
+def test_columns_of_opencvs_names_tell_the_form(columns: str, tmp_path: Path) -> None:
+    cell = Cell()
+    flange, C = cell.truth
+    rows = np.column_stack([quaternions(flange), C[:, :3, 3], Rotation.from_matrix(C[:, :3, :3]).as_rotvec()])
+    names = [f"tcp_pose_{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    names += [columns.replace("rvec", "tvec").format(part) for part in "xyz"]
+    names += [columns.format(part) for part in "xyz"]
+    np.savetxt(tmp_path / "pairs.csv", rows, delimiter=",", header=",".join(names), comments="")
+    assert cell.is_read(believe(look(tmp_path)))
+
+
+def test_rvec_and_tvec_of_a_robot_stay_the_robots(tmp_path: Path) -> None:
+    rows = [
+        {"robot": row} for row in ({"rvec": [0.1 * n, 0, 1], "tvec": [0.3, 0.1 * n, 0.5]} for n in range(5))
+    ]
+    (tmp_path / "samples.json").write_text(json.dumps(rows))
+    (table,) = look(tmp_path).tables
+    assert (table.whose, table.rotation) == ("robot", "rotvec")
+
+
+def test_columns_of_hand_and_eye_tell_the_two_sides_of_a_pair(tmp_path: Path) -> None:
+    cell = Cell(faces_camera=False)
+    flange, C = cell.truth
+    names = [f"{of}_{part}" for of in "he" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    rows = np.column_stack([quaternions(T) for T in (flange, C)])
+    np.savetxt(tmp_path / "pairs.csv", rows, delimiter=",", header=",".join(names), comments="")
+    assert {table.whose for table in look(tmp_path).tables} == {"robot", "board"}
+    assert any(map(cell.is_read, answered(tmp_path, Given())))

@@ -48,6 +48,7 @@ from recordings.importers.conventions import (
     OPTICAL_FROM_AXES,
     Convention,
     convention,
+    possible,
     tells_direction,
 )
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
@@ -207,6 +208,8 @@ def _robots(held: Contents) -> list[Table]:
     if held.told is None:
         return named or unnamed
     if not held.told:
+        if 0 < (pairs := _most_pairs(held, [])) < FEWEST:
+            raise ImportSourceError("too-few-pairs", source=held.root, pairs=pairs, needed=FEWEST)
         there = _listed([f"{len(table.numbers)} {table.name}" for table in held.tables])
         told = {"option": "--poses", "told": held.told_as, "there": there}
         raise ImportSourceError("told-not-there", source=held.root, **told)
@@ -265,6 +268,8 @@ def _no_pairs(held: Contents, robots: list[Table]) -> ImportSourceError:
     there += [f"{len(paths)} {name}" for name, paths in held.images.items()]
     tables = [f"{len(table.numbers)} {table.name}" for table in held.tables]
     said = {"images": _listed(there), "tables": _listed(tables)}
+    if 0 < (pairs := _most_pairs(held, robots)) < FEWEST:
+        return ImportSourceError("too-few-pairs", source=held.root, pairs=pairs, needed=FEWEST)
     unnamed = [table for table in held.tables if table.whose == ""]
     alike = [table for table in unnamed if any(_as_long(table, other) for other in unnamed)]
     if held.told is not None:
@@ -279,12 +284,57 @@ def _no_pairs(held: Contents, robots: list[Table]) -> ImportSourceError:
         ]
         decides = "The program that wrote the tables decides."
         return several_readings(held.root, readings, decides, "which-poses")
-    beside: list[list[Path] | Table] = list(held.images.values())
-    beside += [table for table in held.tables if table not in robots]
-    pairs = max((len(pairs_of(robot, other)) for robot in robots for other in beside), default=0)
-    if 0 < pairs < FEWEST:
-        return ImportSourceError("too-few-pairs", source=held.root, pairs=pairs, needed=FEWEST)
+    if no_poses := _no_poses(held, robots):
+        table, why = no_poses
+        return ImportSourceError(
+            "not-poses", source=held.root, table=table.name, cause=why, reason=_NO_POSES[why]
+        )
     return ImportSourceError("no-pairs", source=held.root, **said)
+
+
+def _most_pairs(held: Contents, robots: list[Table]) -> int:
+    """The most rows of a table of the robot's that go with images, or with another table that may be the
+    board's: also of those tables that are too short to be read."""
+    found: list[int] = []
+    for robot in robots:
+        others: list[list[Path] | Table] = list(held.images.values())
+        others += [
+            table
+            for table in held.tables
+            if table is not robot and (table not in robots or robot.whose == "")
+        ]
+        found += [len(pairs_of(robot, other)) for other in others]
+    short = Counter(each.rows for each in held.short if each.whose in ("robot", ""))
+    counts = [len(paths) for paths in held.images.values()]
+    counts += [each.rows for each in held.short if each.whose == "board"]
+    found += [rows for rows, tables in short.items() if rows in counts or tables > 1]
+    return max(found, default=0)
+
+
+_NO_POSES = {
+    "joints": "its name says joints",
+    "quaternion": "of seven numbers a row no four are a quaternion (of length 1), as of the joints of an arm "
+    "with seven axes",
+    "matrix": "its rows are no rotation matrices beside positions",
+    "numbers": "its numbers are poses in no known unit and order",
+}
+"""Cause → for people."""
+
+
+def _no_poses(held: Contents, robots: list[Table]) -> tuple[Table, str] | None:
+    """(table, why) of one that would go with the images or with the board's poses, if its rows were poses."""
+    others: list[list[Path] | Table] = list(held.images.values())
+    others += [table for table in held.tables if table.whose == "board"]
+    joints = [table for table in held.tables if "joint" in table.name.lower()]
+    for table in [*robots, *joints]:
+        if not any(pairs_of(table, other) for other in others if other is not table):
+            continue
+        if table in joints:
+            return table, "joints"
+        if not possible(table.numbers):
+            causes = {6: "numbers", 7: "quaternion"}
+            return table, causes.get(table.numbers.shape[1], "matrix")
+    return None
 
 
 def _as_long(table: Table, other: Table) -> bool:

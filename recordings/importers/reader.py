@@ -45,7 +45,7 @@ from recordings.importers.reader_messages import (
 )
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import StandstillLimits
-from recordings.importers.tables import Contents, Table
+from recordings.importers.tables import Contents, ShortTable, Table
 
 CPU_LIMIT_S = 15
 """Of a reader: folders of the usual size need one second of it."""
@@ -305,4 +305,5 @@ def _contents(found: FolderRead, blobs: list[bytes]) -> Contents:
         unread=found.unread,
         told=None if found.told is None else [tables[place] for place in found.told],
         told_as=found.told_as,
+        short=[ShortTable(name, rows) for name, rows in found.short],
     )

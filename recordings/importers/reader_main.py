@@ -128,6 +128,7 @@ def _look(request: LookInto, reading: Callable[[Path], None]) -> Frame:
         unread=found.unread,
         told=None if found.told is None else [found.tables.index(table) for table in found.told],
         told_as=found.told_as,
+        short=[(table.name, table.rows) for table in found.short],
     )
     return answer, [table.numbers.tobytes() for table in found.tables]
 

@@ -120,6 +120,8 @@ class FolderRead(msgspec.Struct, frozen=True, tag=True):
     told: list[int] | None
     """Places in `tables`."""
     told_as: str
+    short: list[tuple[str, int]]
+    """Name and rows of each `tables.ShortTable`."""
 
 
 class PoseRead(msgspec.Struct, frozen=True):

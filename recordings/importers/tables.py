@@ -20,7 +20,14 @@ import numpy as np
 
 from recordings.files import read_beginning
 from recordings.image_headers import LFS_POINTER
-from recordings.importers.trees import IMAGE, IMAGE_SUFFIXES, POSE_SIZES, UnreadableArraysError, read_tree
+from recordings.importers.trees import (
+    IMAGE,
+    IMAGE_SUFFIXES,
+    POSE_SIZES,
+    CommasError,
+    UnreadableArraysError,
+    read_tree,
+)
 
 if TYPE_CHECKING:  # messages of bags load more than a folder needs
     from recordings.importers.messages import Array
@@ -28,7 +35,9 @@ if TYPE_CHECKING:  # messages of bags load more than a folder needs
 _FILES_LIMIT = 5000
 _FEWEST_ROWS = 3
 _TWO = 2
-_FEWEST_FOLDERS = 3
+_FEWEST_SIDES = 4
+"""Fewest poses of a list of pairs: of two."""
+_FEWEST_FOLDERS = 2
 """Fewest folders of which each may hold one pose."""
 _FOLDERS_LIMIT = 5000
 _VALUES_LIMIT = 200_000
@@ -54,6 +63,7 @@ _UNREAD = {
 }
 _PROGRAM = next(todo for todo, suffixes in _UNREAD.items() if ".mod" in suffixes)
 _KUKA = re.compile(rb"DEFDAT|\bE6POS\b|\bE6AXIS\b")
+_COMMAS = "to be written with decimal points first: commas part its numbers and its decimals"
 _RESULT = "a result of a calibration, which is not read"
 _BEGINNING_BYTES = 64 * 1024
 _HALVES = {
@@ -128,6 +138,19 @@ class Table:
         return whose_of(self.name)
 
 
+@dataclass(frozen=True)
+class ShortTable:
+    """Numbers that may be poses, of too few rows to be read."""
+
+    name: str
+    rows: int
+
+    @property
+    def whose(self) -> str:
+        """As that of a table."""
+        return whose_of(self.name)
+
+
 @dataclass
 class Contents:
     """What a folder holds."""
@@ -152,6 +175,8 @@ class Contents:
     """The robot's tables that the user names; None: none was named."""
     told_as: str = ""
     """How the user names them."""
+    short: list[ShortTable] = field(default_factory=list)
+    """Tables with too few rows."""
 
 
 @dataclass
@@ -205,6 +230,9 @@ def look(
                 found.unread[alike] = _RESULT
                 continue
             nodes = list(islice(_nodes(tree, (), ""), _VALUES_LIMIT + 1))
+        except CommasError:
+            found.unread[alike] = _COMMAS
+            continue
         except UnreadableArraysError as problem:
             found.unread[alike] = f"to be saved as CSV first ({problem})"
             continue
@@ -244,7 +272,9 @@ def look(
             told_numbers = np.array([row.numbers for row in some])
             table = _without_count(told_numbers)
             poses_alike = table.shape[1] in (6, 7, 12, 16) and float(np.abs(table).max()) <= _NUMBER_LIMIT
-            if len(some) >= 3 and poses_alike:
+            if poses_alike and len(some) < _FEWEST_ROWS:
+                found.short.append(ShortTable(_name_of_part(name, part), len(some)))
+            elif poses_alike:
                 counts = told_numbers[:, 0] if table.shape[1] < told_numbers.shape[1] else None
                 beside = _names_of_rows(some, counts, found.images), [row.place for row in some]
                 found.tables.append(
@@ -263,7 +293,7 @@ def _folded(files: list[Path]) -> dict[Path, str]:
     """Files → their name with digits as #: those with the same one belong together.
 
     Digits of a folder tell sessions and cameras apart. They are folded only where there is one folder for
-    each pose: at least three folders alike, with one file of the kind in each.
+    each pose: at least two folders alike, with one file of the kind in each.
     """
     kinds = defaultdict[str, list[Path]](list)
     for file in files:
@@ -378,7 +408,7 @@ def _parts_of(rows: list[_Row]) -> dict[str, list[_Row]]:
     also be one table, of a grid of places.
     """
     last = [row.place[-1] if row.place else 0 for row in rows]
-    if len(rows) > 4 and last == [0, 1] * (len(rows) // 2):
+    if len(rows) >= _FEWEST_SIDES and last == [0, 1] * (len(rows) // 2):
         return {" robot": rows[::2], " board": rows[1::2]}
     parts = {"": rows}
     lengths = {len(row.place) for row in rows}

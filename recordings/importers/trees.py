@@ -41,6 +41,10 @@ _TIME = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?"
 DATES = re.compile(rf"(?<![\w.]){_DAY}{_BEHIND_A_DAY}{_ZONE}(?![\w.])|(?<![\w.:]){_TIME}(?![\w.:])")
 """Dates and times of day, which are no numbers of a pose."""
 _CELLS = re.compile(r"\s*[;\t]\s*|\s+")
+_COMMA_CELLS = re.compile(r"\s*[;\t]\s*|,?\s+")
+"""What parts cells where a comma with a space behind it does, and one without is a decimal comma."""
+_QUOTED = re.compile(r"([\"'])([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)\1")
+_ONLY_COMMAS = re.compile(r"\s*[-+]?\d+,\d+(?:,[-+]?\d+,\d+)*\s*")
 _WITH_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?|[-+]?\d+")
 _COMMENT = ("#", "%")
 _BOARD_IN_WORDS = re.compile(
@@ -52,6 +56,17 @@ _SENTENCE = 200
 """Most letters of a line that tells of a board in words."""
 _MOST_OF_A_BOARD = 4
 """Most numbers of such a line: two sides, a square and a marker."""
+_MARKED = (  # the mark of UTF-32 begins with that of UTF-16
+    ((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE), "utf-32"),
+    ((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE), "utf-16"),
+)
+_ZEROS = {
+    "utf-32-le": ((2, 4), (3, 4)),
+    "utf-32-be": ((0, 4), (1, 4)),
+    "utf-16-le": ((1, 2),),
+    "utf-16-be": ((0, 2),),
+}
+"""Encodings → first place and step of the bytes that are mostly 0 in a text of Latin letters."""
 _SAMPLE_BYTES = 2000
 _MOSTLY = 0.4
 POSE_SIZES = (6, 7, 12, 16, 8, 13, 17)
@@ -62,10 +77,14 @@ class UnreadableArraysError(ValueError):
     """A file of arrays from which no numbers can be taken; says why."""
 
 
+class CommasError(ValueError):
+    """Commas part the numbers of a file and their decimals, and nothing tells which do which."""
+
+
 def read_tree(path: Path) -> Any:
     """A data file as dicts, lists, numbers and texts; None: no such file, or not readable as what it says.
 
-    Raises UnreadableArraysError for a damaged .npy, .npz or .mat.
+    Raises UnreadableArraysError for a damaged .npy, .npz or .mat, CommasError for what its name says.
     """
     suffix = path.suffix.lower()
     try:
@@ -84,32 +103,56 @@ def read_tree(path: Path) -> Any:
             plain = re.sub(r"^%YAML.*\n|!!opencv-matrix|!!python/\S+", "", text)
             return strict_yaml.load_plain(plain.encode())
         return _of_text(_with_points(text))
-    except UnreadableArraysError:
+    except (UnreadableArraysError, CommasError):
         raise
     except (OSError, ValueError, EOFError, RecursionError, yaml.YAMLError, ElementTree.ParseError):
         return None
 
 
 def _decoded(content: bytes) -> str:
-    """The text of a file in UTF-8 or UTF-16, with its mark of the order of bytes or without."""
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return content.decode("utf-16", "replace")
-    for first, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):  # of Latin letters every other byte is 0
-        zeros = content[first:_SAMPLE_BYTES:2]
-        if zeros and zeros.count(0) > _MOSTLY * len(zeros):
+    """The text of a file in UTF-8, UTF-16 or UTF-32, with its mark of the order of bytes or without."""
+    for marks, encoding in _MARKED:
+        if content.startswith(marks):
             return content.decode(encoding, "replace")
+    for encoding, places in _ZEROS.items():
+        zeros = [content[first:_SAMPLE_BYTES:step] for first, step in places]
+        if all(each and each.count(0) > _MOSTLY * len(each) for each in zeros):
+            return content.decode(encoding, "replace").removeprefix("\ufeff")
     return content.decode("utf-8-sig", "replace")
 
 
 def _with_points(text: str) -> str:
-    """The text with decimal points, where all lines of numbers have decimal commas."""
+    """The text with decimal points, where all lines of numbers have decimal commas.
+
+    CommasError where commas without a space part the numbers, too.
+    """
+    text = _QUOTED.sub(r"\2.\3", text)
     if re.search(r"\d\.\d", _without_words(text)):
         return text
-    separated = [_CELLS.split(line.strip().strip(";")) for line in text.splitlines()]
-    rows = [cells for cells in separated if len(cells) >= min(POSE_SIZES) and _WITH_COMMA.search(cells[-1])]
-    if not rows or not all(_is_cell(cell) for cells in rows for cell in cells):
-        return text
-    return re.sub(r"(?<![\w.,])([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)(?![\w,])", r"\1.\2", text)
+    lines = text.splitlines()
+    for between in (_CELLS, _COMMA_CELLS):
+        separated = [between.split(line.strip().strip(";")) for line in lines]
+        rows = [n for n, cells in enumerate(separated) if _is_row(cells)]
+        if rows and all(_is_cell(cell) for n in rows for cell in separated[n]):
+            for n in rows:
+                lines[n] = "; ".join(cell.replace(",", ".") for cell in separated[n])
+            return "\n".join(lines)
+    if _are_parted_by_commas_twice(lines):
+        raise CommasError
+    return text
+
+
+def _is_row(cells: list[str]) -> bool:
+    return len(cells) >= min(POSE_SIZES) and bool(_WITH_COMMA.search(cells[-1]))
+
+
+def _are_parted_by_commas_twice(lines: list[str]) -> bool:
+    """Tell whether lines are of the kind 1,523,-2,071,…: every other number has no sign, and is one of many
+    digits somewhere: so are decimals, and no matrix of whole numbers is a pose."""
+    rows = [line.strip().split(",") for line in lines if _ONLY_COMMAS.fullmatch(line)]
+    decimals = [cell for cells in rows for cell in cells[1::2]]
+    sizes = {len(cells) // 2 for cells in rows}
+    return bool(rows) and sizes <= {*POSE_SIZES} and max(map(len, decimals)) > 1
 
 
 def _without_words(text: str) -> str:

@@ -23,6 +23,7 @@ from calibrate.imported.described import described
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
 from recordings.geometry import pose, rotation_exp
+from recordings.importers import reader
 from recordings.importers.tables import look
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind
@@ -297,13 +298,41 @@ def test_dates_commas_and_encodings(what: str, encoding: str, shots: Shots, tmp_
     require_right(shots, tmp_path)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+ENCODINGS = ("utf-8-sig", *(f"utf-{size}{order}" for size in (16, 32) for order in ("", "-le", "-be")))
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("suffix", ["json", "yaml"])
 def test_other_encodings_of_trees(suffix: str, encoding: str, shots: Shots, tmp_path: Path) -> None:
     save_images(shots, tmp_path, "images/{n}.png")
     text = json.dumps([{"tcp": each.tolist()} for each in shots.flanges["one"]])
     (tmp_path / f"robot.{suffix}").write_text(text, encoding=encoding)
     require_right(shots, tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("between", ["; ", ", ", ",  ", "quoted"])
+def test_decimal_commas_are_told_from_those_between(between: str, encoding: str, tmp_path: Path) -> None:
+    numbers = np.random.default_rng(1).normal(size=(6, 6)) * 100
+    cells = [[f"{number:.4f}".replace(".", ",") for number in row] for row in numbers]
+    quoted = ['"' + '","'.join(row) + '"' for row in cells]
+    rows = quoted if between == "quoted" else [between.join(row) for row in cells]
+    (tmp_path / "robot.txt").write_text("\n".join(rows), encoding=encoding)
+    (table,) = look(tmp_path).tables
+    np.testing.assert_allclose(table.numbers, numbers, atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [6, 7])
+def test_commas_that_part_numbers_and_decimals_are_named(count: int, tmp_path: Path) -> None:
+    numbers = np.random.default_rng(1).normal(size=(8, count)) * 100
+    rows = [",".join(f"{number:.3f}".replace(".", ",") for number in row) for row in numbers]
+    (tmp_path / "robot.csv").write_text("\n".join(rows))
+    held = look(tmp_path)
+    assert not held.tables
+    assert "robot.csv" in held.unread
+    with raises("no-pairs") as refused:
+        believe(held)
+    assert "robot.csv" in str(refused.value.values["images"])
 
 
 def test_matrices_stacked_along_the_last_axis_are_poses(shots: Shots, tmp_path: Path) -> None:
@@ -589,6 +618,81 @@ def test_a_grid_of_places_is_one_table(shots: Shots, tmp_path: Path) -> None:
         told = " ".join(map(str, quaternions(shots.flanges["one"])[n]))
         (tmp_path / f"tcp_{n // 4}_{n % 4}.txt").write_text(told)
     assert require_right(shots, tmp_path) == {"one"}
+
+
+# ---- too few, and what are no poses
+
+
+def as_rows(folder: Path, T: np.ndarray, C: np.ndarray) -> None:
+    np.savetxt(folder / "robot.txt", quaternions(T))
+    np.savetxt(folder / "marker.txt", quaternions(C))
+
+
+def as_unnamed_rows(folder: Path, T: np.ndarray, C: np.ndarray) -> None:
+    np.savetxt(folder / "a.txt", quaternions(T))
+    np.savetxt(folder / "b.txt", quaternions(C))
+
+
+def as_a_list_of_pairs(folder: Path, T: np.ndarray, C: np.ndarray) -> None:
+    pairs = [[F.tolist(), G.tolist()] for F, G in zip(T, C, strict=True)]
+    (folder / "pairs.json").write_text(json.dumps(pairs))
+
+
+def as_samples(folder: Path, T: np.ndarray, C: np.ndarray) -> None:
+    rows = [{"tcp": F.tolist(), "target": G.tolist()} for F, G in zip(T, C, strict=True)]
+    (folder / "samples.json").write_text(json.dumps({"samples": rows}))
+
+
+def as_images(folder: Path, T: np.ndarray, C: np.ndarray) -> None:
+    np.savetxt(folder / "robot.txt", quaternions(T))
+    for n in range(len(T)):
+        cv2.imwrite(str(folder / f"{n}.png"), np.full((384, 480), 10 * n, np.uint8))
+
+
+def as_folders(folder: Path, T: np.ndarray, C: np.ndarray) -> None:
+    for n, each in enumerate(T):
+        (folder / f"pose_{n}").mkdir()
+        (folder / f"pose_{n}/data.json").write_text(json.dumps({"O_T_EE": each.tolist()}))
+        cv2.imwrite(str(folder / f"pose_{n}/image.png"), np.full((384, 480), 10 * n, np.uint8))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+@pytest.mark.parametrize(
+    "write", [as_rows, as_unnamed_rows, as_a_list_of_pairs, as_samples, as_images, as_folders]
+)
+def test_fewer_than_needed_are_counted(
+    write: Callable[[Path, np.ndarray, np.ndarray], None], count: int, tmp_path: Path
+) -> None:
+    scene = Scene(views=12)
+    robot = np.array(scene.flange_poses()[0])[:count]
+    write(tmp_path, robot, np.array(scene.camera_from_board())[:count])
+    if write is as_a_list_of_pairs and count == 1:
+        pytest.skip("two poses in a list may be anything")
+    with raises("too-few-pairs", pairs=count, needed=5):
+        believe(look(tmp_path))
+    with raises("too-few-pairs", pairs=count, needed=5):
+        believe(reader.look(tmp_path))
+
+
+def test_fewer_than_needed_are_counted_where_the_robots_are_told(tmp_path: Path) -> None:
+    scene = Scene(views=12)
+    for count in (1, 2, 4):
+        as_rows(
+            tmp_path, np.array(scene.flange_poses()[0])[:count], np.array(scene.camera_from_board())[:count]
+        )
+        with raises("too-few-pairs", pairs=count, needed=5):
+            believe(look(tmp_path, Path("robot.txt")))
+
+
+@pytest.mark.parametrize("name", ["robot.csv", "joints.csv", "poses.csv"])
+def test_joints_are_not_called_poses(name: str, tmp_path: Path) -> None:
+    """Of seven axes: as many numbers as of a pose with a quaternion."""
+    joints = np.random.default_rng(0).uniform(-2, 2, (12, 7))
+    np.savetxt(tmp_path / name, joints, delimiter=",")
+    np.savetxt(tmp_path / "marker.txt", quaternions(np.array(Scene(views=12).camera_from_board())))
+    cause = "joints" if "joint" in name else "quaternion"
+    with raises("not-poses", table=name, cause=cause):
+        believe(look(tmp_path))
 
 
 # ---- files that are not used

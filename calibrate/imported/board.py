@@ -20,6 +20,7 @@ from calibrate.boards.grids import count_circles, seen_size
 from calibrate.boards.markers import marker_detector
 from calibrate.boards.model import board_points, usual_markers
 from calibrate.errors import CalibrationError
+from calibrate.imported.charuco import DICTIONARIES, layouts, markers_in_squares
 from calibrate.imported.described import Described, described
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import Candidate, candidate_poses
@@ -31,6 +32,7 @@ from recordings.images import decode_image
 from recordings.importers.conventions import Convention, possible
 from recordings.importers.messages import Progress
 from recordings.importers.tables import Contents, Table
+from recordings.schema.boards import board_problem
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 
 FEWEST = 5
@@ -131,6 +133,9 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
         known = each.known
         points = board_points(board)
         found = dict(_search(small, board, known, progress))
+        if given is None and board.kind is BoardKind.CHESSBOARD:
+            board, found = _with_its_markers(held, board, found, small, progress)
+            points = board_points(board)
         views: dict[Key, BoardView] = {
             path: BoardView(
                 n,
@@ -148,7 +153,8 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
         if camera is not None:
             candidates = {path: candidate_poses(view, camera[0], board) for path, view in views.items()}
             without = [small[path] for path in images if path not in views]
-            another = _another(board, [tried.board for tried in likely], without)
+            others = [tried.board for tried in likely if tried is not each]
+            another = _another(each.board, others, without)
             return Seen(
                 board,
                 known,
@@ -161,6 +167,44 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
                 size_told=each.size_told,
             )
     return None
+
+
+def _with_its_markers(
+    held: Contents,
+    board: BoardSpec,
+    found: dict[Path, Detection],
+    images: dict[Path, Grey],
+    progress: Progress,
+) -> tuple[BoardSpec, dict[Path, Detection]]:
+    """A chessboard and where it was found, or those of the ChArUco board of which it is the inside.
+
+    ImportSourceError where there are markers in its squares, and no board of them is found.
+    """
+    shown = [*found][:: max(1, len(found) // _TRIED)]
+    markers = markers_in_squares(board, [(images[path], found[path].pixels) for path in shown])
+    if markers is None:
+        return board, found
+    few = [images[path] for path in shown][:_ANOTHER]
+    boards = [each for each in layouts(board, markers) if board_problem(each) is None]
+    corners = [_corners(few, each) for each in boards]
+    if not any(corners):
+        raise ImportSourceError(
+            "charuco-undescribed",
+            source=held.root,
+            columns=board.columns,
+            rows=board.rows,
+            dictionary=markers.dictionary,
+        )
+    charuco = boards[int(np.argmax(corners))]
+    return charuco, dict(_search(images, charuco, True, progress))
+
+
+def _corners(images: list[Grey], board: BoardSpec) -> int:
+    """Corners of a board that are seen at a glance; 0 also where it has more markers than its dictionary."""
+    try:
+        return sum(detect(image, board, thorough=False).corners for image in images)
+    except CalibrationError:
+        return 0
 
 
 def _another(board: BoardSpec, boards: list[BoardSpec], images: list[Grey]) -> tuple[BoardSpec, int] | None:
@@ -276,7 +320,7 @@ def _shown(greys: list[Grey], told: Described) -> Iterator[tuple[BoardSpec, Grey
     """Boards that images suggest, with the lengths that are told: a tag that most of a few show, and
     chessboards."""
     few = greys[:: max(1, len(greys) // _TRIED)]
-    for dictionary in _DICTIONARIES:
+    for dictionary in (f"DICT_{end}" for end in DICTIONARIES):
         detector = marker_detector(dictionary, 1)
         ids = [detector.detectMarkers(grey)[1] for grey in few]
         tags = Counter(int(tag) for seen in ids if seen is not None for tag in np.unique(seen))
@@ -303,8 +347,3 @@ def _shown_circles(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
             if count % columns == 0:
                 for kind in (BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES):
                     yield from ((BoardSpec(kind, columns, count // columns), grey) for grey in alike)
-
-
-_DICTIONARIES = [
-    f"DICT_{name}" for name in ["4X4_1000", "5X5_1000", "6X6_1000", "ARUCO_ORIGINAL", "APRILTAG_36H11"]
-]

@@ -504,6 +504,7 @@ def _board(best: TableReading) -> tuple[BoardSpec, str]:
     guessed = msgspec.structs.replace(
         board,
         square_m=round(1e-3 * square_mm, 6),
+        marker_m=board.marker_m and board.marker_m * factor,
         square_tolerance=round(tolerance, 4),
         square_guessed=True,
     )

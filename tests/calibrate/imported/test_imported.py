@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -450,3 +451,46 @@ def test_two_boards_in_a_set_are_told_apart(counts: tuple[int, int], tmp_path: P
     assert taken.square_m == pytest.approx(true.square_m, rel=0.01)
     assert f"{other.columns}×{other.rows}" in found.facts["another"][0]
     assert "outliers" not in found.facts
+
+
+CHARUCO = BoardSpec(BoardKind.CHARUCO, 6, 8, 0.03, 0.022, "DICT_5X5_100")
+
+
+def shown_to_a_camera(folder: Path, shown: BoardSpec, views: int = 6) -> np.ndarray:
+    """Write images of a board, and return the robot's poses."""
+    recording = open_recording(write_session(folder / "s.mcap", Scene(shown, views=views)))
+    poses = []
+    for view, image in recording.images():
+        poses.append(view.base_from_flange)
+        cv2.imwrite(str(folder / f"{view.index}.png"), image.pixels)
+    (folder / "s.mcap").unlink()
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_charuco_board_that_nobody_described_is_no_chessboard(legacy: bool, tmp_path: Path) -> None:
+    true = msgspec.structs.replace(CHARUCO, legacy=legacy)
+    np.savetxt(tmp_path / "robot.txt", quaternions(shown_to_a_camera(tmp_path, true)))
+    found = believe(look(tmp_path), Given(mount="eye-in-hand")).dataset.board
+    layout = ("kind", "columns", "rows", "legacy")
+    assert [getattr(found, name) for name in layout] == [getattr(true, name) for name in layout]
+    assert found.dictionary == "DICT_5X5_50"
+    assert found.square_m == pytest.approx(true.square_m, rel=0.01)
+    assert found.marker_m is not None and true.marker_m is not None
+    assert found.marker_m / found.square_m == pytest.approx(true.marker_m / true.square_m, rel=0.05)
+
+
+def test_a_charuco_board_of_an_unusual_layout_is_asked_about(tmp_path: Path) -> None:
+    """Its markers begin with another number than 0."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    painted = cv2.aruco.CharucoBoard((6, 8), 0.03, 0.022, dictionary, np.arange(60, 84))
+    flat = painted.generateImage((480, 640), marginSize=20)
+    corners = np.array([[0, 0], [480, 0], [480, 640], [0, 640]], np.float32)
+    rng = np.random.default_rng(0)
+    paths = [tmp_path / f"{n}.png" for n in range(6)]
+    for path in paths:
+        seen_at = (corners + np.array([80, 60]) + rng.uniform(-25, 25, (4, 2))).astype(np.float32)
+        H = cv2.getPerspectiveTransform(corners, seen_at)
+        cv2.imwrite(str(path), cv2.warpPerspective(flat, H, (640, 760), borderValue=200))
+    with raises("charuco-undescribed", dictionary="DICT_5X5_100"):
+        board.see_board(look(tmp_path), None, paths, lambda *_: None)

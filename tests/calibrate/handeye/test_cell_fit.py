@@ -1,5 +1,7 @@
 """A camera or a board that was moved half-way is named, and boards that were read turned are set right."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -29,11 +31,12 @@ def moved_cell(seed, mount, what, at, views=24, size=1.0):
 )
 def test_a_move_half_way_is_named_with_its_place_and_does_not_pass(mount, what, size):
     views, _, _ = moved_cell(0, mount, what, 12, size=size)
-    solution = solve_views(views, QUICK)
-    assert solution.judgement.session.reading is (
-        Reading.CAMERA_MOVED if what == "camera" else Reading.BOARD_MOVED
-    )
-    assert abs(solution.judgement.session.at - 12) <= 1
+    numbered = replace(views, views=tuple(replace(view, index=2 * view.index + 5) for view in views))
+    solution = solve_views(numbered, QUICK)
+    session = solution.judgement.session
+    assert session.reading is (Reading.CAMERA_MOVED if what == "camera" else Reading.BOARD_MOVED)
+    assert abs(session.at - 12) <= 1
+    assert session.numbers == tuple(2 * place + 5 for place in (session.at, *session.between))
     assert "session" in [g.name for g in judge(solution) if not g.passed]
 
 

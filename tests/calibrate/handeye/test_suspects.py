@@ -95,6 +95,25 @@ def test_a_pose_wrong_in_all_its_numbers_has_no_named_cause():
     assert (rejected.index, rejected.kind, rejected.wrong_number) == (7, "inconsistent", None)
 
 
+def test_what_is_said_of_a_view_is_its_own_where_an_earlier_one_is_rejected():
+    c = cell()
+    slip = np.array([[0.02, 0.03, -0.01, 0.02, 0.05, 0.04]])
+    solution = solve_views(nudged(c.views, [1], slip), QUICK)
+    without = solve_views(c.views.select([i for i in range(20) if i != 1]), QUICK)
+    told, expected = solution.evidence.residuals, without.evidence.residuals
+    assert [one.index for one in told] == [one.index for one in expected]
+    for name in ("rms_px", "robot_mm", "robot_deg"):
+        found = [getattr(one, name) for one in told]
+        assert found == pytest.approx([getattr(one, name) for one in expected], rel=0.15, abs=1e-3), name
+
+
+def test_the_farther_off_a_view_the_likelier_it_is_called_an_outlier():
+    c = cell()
+    solutions = [solve_views(nudged(c.views, [7], size * SIGMA[None]), QUICK) for size in (3.0, 6.0, 9.0)]
+    told = [solution.evidence.suspects[7] for solution in solutions if 7 in solution.evidence.suspects]
+    assert len(told) >= 2 and told == sorted(told) and told[-1] > 0.9
+
+
 def test_the_farther_off_a_view_the_less_it_counts_and_doubt_is_said():
     c = cell()
     weights, states = [], []

@@ -11,7 +11,7 @@ from mcap.records import Metadata
 
 from recordings.files import read_beginning
 from recordings.mcap.records import MAGIC, BadRecordError, parse, require_crc, split
-from recordings.schema.definitions import SESSION_RECORDS
+from recordings.schema.definitions import SESSION_RECORDS, decode_session
 from recordings.schema.messages import CameraIdentity, RobotIdentity, SessionInfo
 
 _BEGINNING_BYTES = 1024 * 1024
@@ -89,7 +89,7 @@ def description_of(path: Path) -> SessionInfo | None:
                 if record.name == SESSION_RECORDS[0]:
                     if "crc32" in record.metadata:
                         require_crc(record.metadata)
-                    return msgspec.json.decode(record.metadata.get("session", ""), type=SessionInfo)
+                    return decode_session(record.metadata.get("session", ""))
     except (OSError, BadRecordError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
     return None

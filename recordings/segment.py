@@ -27,6 +27,7 @@ from recordings.schema.definitions import (
     PictureFacts,
     SchemaError,
     decode,
+    decode_session,
     schema_difference,
 )
 from recordings.schema.messages import (
@@ -198,7 +199,7 @@ class RecordingSegment:
             except BadRecordError as error:
                 raise self._unusable(str(error)) from error
         try:
-            info = msgspec.json.decode(record.get("session", ""), type=SessionInfo)
+            info = decode_session(record.get("session", ""))
         except (msgspec.DecodeError, RecursionError) as error:
             raise self._unusable(f"its description does not fit this version: {error}") from error
         if not is_session_name(info.name) or not 1 <= info.part <= PARTS_LIMIT:

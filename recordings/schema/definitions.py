@@ -16,11 +16,12 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from msgspec import inspect
 
+from recordings.schema.earlier import lift_session
 from recordings.schema.messages import (
     CaptureEvent,
-    ClockReading,
     FrameTime,
     RobotState,
+    SessionInfo,
     Stamps,
     Stillness,
     View,
@@ -52,6 +53,21 @@ class PictureFacts(msgspec.Struct, frozen=True, omit_defaults=True):
     pixel_format: str = "Mono8"
     trigger_count: int | None = None
     time: FrameTime | None = None
+
+
+class ClockReading(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One reading of a camera's clock: it showed `device_ns` between question and answer.
+
+    Only recordings of earlier versions have it, and nothing reads it. Their schemas name it, so it stays.
+    """
+
+    asked_monotonic_ns: int
+    answered_monotonic_ns: int
+    device_ns: int
+    host_wall_ns: int = 0
+    """Host wall clock at the answer; 0 = not read"""
+    synchronized: bool = False
+    """The camera says that its clock is locked by PTP"""
 
 
 class SchemaError(ValueError):
@@ -190,6 +206,11 @@ def _from_proto(struct: type[msgspec.Struct], message: Any) -> dict[str, Any]:
 def _rows(numbers: Any) -> tuple[tuple[float, ...], ...]:
     flat = tuple(numbers)
     return tuple(flat[i : i + _MATRIX_COLUMNS] for i in range(0, len(flat), _MATRIX_COLUMNS))
+
+
+def decode_session(text: str) -> SessionInfo:
+    """Read the description in a session record, of any version. Raises msgspec.DecodeError."""
+    return msgspec.convert(lift_session(msgspec.json.decode(text)), SessionInfo)
 
 
 def schema_difference(ours: bytes, theirs: bytes) -> str:

@@ -6,11 +6,12 @@ These are the types that every room shares. How they lie in the file is `schema`
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import msgspec
 
 from recordings.plain_text import device_text
+from recordings.schema.earlier import GONE_OF_BOARD
 
 if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
     import numpy as np
@@ -56,6 +57,8 @@ SINGLE_TAGS = (BoardKind.ARUCO, BoardKind.APRIL_TAG)
 class BoardSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A calibration board as its owner would describe it."""
 
+    GONE: ClassVar = GONE_OF_BOARD
+
     kind: BoardKind
     columns: int = 1
     """Inner corners (chessboard), circles, tags, or squares (charuco, as OpenCV counts); a single tag: 1."""
@@ -66,8 +69,6 @@ class BoardSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
     """charuco: side of a marker. april-grid: the gap between tags."""
     dictionary: str | None = None
     legacy: bool = False
-    radon_marker: bool = False
-    """No effect: of files of earlier versions."""
     tag_id: int = msgspec.field(default=0, name="id")
     """Number of a single tag in its dictionary."""
     square_tolerance: float | None = None
@@ -104,8 +105,6 @@ class RobotIdentity(_Device, frozen=True, forbid_unknown_fields=True, omit_defau
     tcp_offset: Vector6 = (0.0,) * 6
     """flange_from_tcp as on the pendant: x y z [m], rotation vector [rad]. Kept beside, never mixed in."""
     payload_kg: float = 0.0
-    safety_checksum: str = ""
-    """No effect: of files of earlier versions."""
 
 
 ARM_KINEMATICS_NAME = "arm-kinematics.json"
@@ -192,21 +191,6 @@ class FrameTime(msgspec.Struct, frozen=True):
     bound_s: float
     """95 % bound of the error"""
     source: TimeSource
-
-
-class ClockReading(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One reading of a camera's clock: it showed `device_ns` between question and answer.
-
-    Recorded by earlier versions.
-    """
-
-    asked_monotonic_ns: int
-    answered_monotonic_ns: int
-    device_ns: int
-    host_wall_ns: int = 0
-    """Host wall clock at the answer; 0 = not read"""
-    synchronized: bool = False
-    """The camera says that its clock is locked by PTP"""
 
 
 class RobotState(msgspec.Struct, frozen=True):

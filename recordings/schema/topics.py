@@ -15,8 +15,8 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from recordings.schema.definitions import PictureFacts, message_class
-from recordings.schema.messages import CaptureEvent, ClockReading, RobotState, View
+from recordings.schema.definitions import ClockReading, PictureFacts, message_class
+from recordings.schema.messages import CaptureEvent, RobotState, View
 
 
 class Topic(StrEnum):

@@ -15,6 +15,7 @@ import msgspec
 
 from recordings.files import PART_SUFFIX, read_file, session_name_from, sync_folder, write_atomically
 from recordings.same_session import description_of
+from recordings.schema.earlier import lift_session
 from recordings.schema.messages import SessionInfo, Source
 from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
@@ -106,7 +107,10 @@ def read_state(folder: Path) -> SessionState | None:
     """Read a session's state; None where it is missing or invalid."""
     try:
         text = _UNDER_WAY.sub(b'"state":"planned"', read_file(folder / STATE_FILE, _LIMIT_BYTES))
-        return msgspec.json.decode(text, type=SessionState)
+        plain = msgspec.json.decode(text)
+        if isinstance(plain, dict) and "first" in plain:
+            plain["first"] = lift_session(plain["first"])
+        return msgspec.convert(plain, SessionState)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.schema.definitions import (
+    ClockReading,
     PictureFacts,
     SchemaError,
     decode,
@@ -20,7 +21,6 @@ from recordings.schema.definitions import (
 )
 from recordings.schema.messages import (
     CaptureEvent,
-    ClockReading,
     FrameTime,
     RobotState,
     Stamps,

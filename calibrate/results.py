@@ -38,7 +38,7 @@ class Gate(msgspec.Struct, frozen=True):
     """A condition that a calibration must meet before it may be installed."""
 
     name: str
-    """Id: the name of its limit in `GateLimits` (files of earlier versions hold other names)."""
+    """Id: the name of its limit in `GateLimits`."""
     passed: bool
     value: float | None
     """Value in `unit`; None in a file where it was not a finite number."""
@@ -215,7 +215,7 @@ class Arm(msgspec.Struct, frozen=True):
     table: list[ArmErrorValue]
     """Only their sum at the flange is known well, not each one."""
     size_mrad: float = 0.0
-    """1σ of the links' turns, or of a bracket's bend; 0 in older files, whose `size_mm` is both."""
+    """1σ of the links' turns, or of a bracket's bend."""
 
 
 class BoardShape(msgspec.Struct, frozen=True):

@@ -11,7 +11,7 @@ import numpy as np
 from calibrate.boards.model import check_board
 from calibrate.errors import UsageError
 from calibrate.files.calibration import read_calibration
-from calibrate.files.integrity import FORMATS
+from calibrate.files.earlier import FORMATS
 from calibrate.lens.intrinsics import LensModel
 from calibrate.pipeline.gates import GateLimits
 from calibrate.views.projection import camera_matrix, distortion

@@ -148,7 +148,8 @@ class Override(msgspec.Struct, frozen=True):
 
 
 class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
-    format: Literal["handeye-calibration/1", "handeye-calibration/2"]
+    format: Literal["handeye-calibration/2"]
+    """Of what is read, too: files of earlier formats become today's (`earlier`)."""
     created: str
     """Time of the solve, UTC; not in the hash. Two runs on one recording differ in nothing else."""
     source: Source
@@ -171,7 +172,7 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     arm_table: CorrectedArm | None = None
     """The arm's corrected kinematics, where they are known; `result` does not depend on them."""
     posterior: Posterior | None = None
-    """What later checks begin with; None in files of the first version."""
+    """What later checks begin with; None in files that began in the first format."""
 
     @property
     def transform(self) -> Transform:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
+import math
 import shlex
 from decimal import Decimal
 from pathlib import Path
@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from calibrate.errors import CalibrationFileError
+from calibrate.files.earlier import FORMATS, digits_of_before, lift_calibration
+from calibrate.files.fields import wrong_field
 from calibrate.files.folders import VERSION_NAME
 from recordings import strict_yaml
 from recordings.files import read_beginning
-from recordings.geometry import is_rigid, matrix_from_quaternion
+from recordings.geometry import Array, is_rigid, matrix_from_quaternion
 
-FORMATS = ("handeye-calibration/1", "handeye-calibration/2")
-"""The second adds `posterior`."""
 _MCAP = b"\x89MCAP"
 _LIMIT_BYTES = 4 * 1024 * 1024
 
@@ -40,20 +40,14 @@ def require_content_of_name(path: Path, content: bytes) -> None:
     match = VERSION_NAME.fullmatch(path.name)
     if match is None or path.parent.name != "gen":
         return
-    digits = match[2].encode()
-    of_before = _HASH_LINE.search(content)  # earlier versions of the software took them from this line
-    if hashlib.sha256(content).hexdigest()[:8].encode() != digits and (
-        of_before is None or of_before[1] != digits
-    ):
+    digits = match[2]
+    if digits not in (hashlib.sha256(content).hexdigest()[:8], digits_of_before(content)):
         why = "it is not the file that was installed by this name: another one was copied over it"
         raise CalibrationFileError("damaged-calibration", path=path, why=why)
 
 
-_HASH_LINE = re.compile(rb"^sha256: '?([0-9a-f]{8})", re.MULTILINE)
-
-
 def verified_plain(content: bytes, where: str) -> dict[str, Any]:
-    """Parse a calibration file to plain data without `sha256`, after verifying its hash.
+    """Parse a calibration file to plain data of today's format, without `sha256`, after verifying its hash.
 
     CalibrationFileError says what is wrong.
     """
@@ -68,7 +62,7 @@ def verified_plain(content: bytes, where: str) -> dict[str, Any]:
         if not isinstance(plain, dict) or found not in FORMATS:
             raise _other(where, f"format is {found!r}, expected {FORMATS[-1]!r}")
         if plain.pop("sha256", None) == content_sha256(plain):
-            return plain
+            return lift_calibration(plain)
         why = "the content does not fit its hash"
     except (strict_yaml.StrictYamlError, TypeError, ValueError) as problem:
         why = str(problem)
@@ -89,52 +83,109 @@ def content_sha256(plain: dict[str, Any]) -> str:
 def canonical_json(value: object) -> str:
     """Encode as JSON with sorted keys and no spaces, as `msgspec.json.encode(order="deterministic")` does.
 
-    TypeError for types that JSON does not have.
+    TypeError for what JSON does not have, ValueError for numbers that are not finite.
     """
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
-    return _STRING_OR_POWER.sub(_as_msgspec_writes, text)
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float):
+        return _number_text(value)
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(canonical_json, value))}]"
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        entries = (f"{canonical_json(key)}:{canonical_json(value[key])}" for key in sorted(value))
+        return f"{{{','.join(entries)}}}"
+    raise TypeError(f"a calibration file holds no {type(value).__name__}, and its keys are texts")
 
 
-_STRING_OR_POWER = re.compile(r'"(?:[^"\\]|\\.)*"|-?[\d.]+e[+-]\d+')
+def _number_text(number: float) -> str:
+    """The shortest text, with an exponent below 1e-5 and from 1e16: Python's own begins one power earlier."""
+    if not math.isfinite(number):
+        raise ValueError(f"{number} is not a finite number")
+    text = float.__repr__(number)
+    mantissa, _, exponent = text.partition("e")
+    if not exponent:
+        return text
+    power = int(exponent)
+    return f"{Decimal(text):f}" if power == -5 else f"{mantissa}e{power}"
 
 
-def _as_msgspec_writes(found: re.Match[str]) -> str:
-    """Strings as they are; 1e-05 as 0.00001, 1e+16 as 1e16."""
-    mantissa, _, exponent = found[0].partition("e")
-    if found[0].startswith('"'):
-        return found[0]
-    return f"{Decimal(found[0]):f}" if int(exponent) == -5 else f"{mantissa}e{int(exponent)}"
+def check_plain(plain: dict[str, Any], where: str) -> None:
+    """Check what `verified_plain` returned as `read_calibration` does, without msgspec.
+
+    CalibrationFileError says what is wrong.
+    """
+    if wrong := wrong_field(plain):
+        raise CalibrationFileError(path=where, why=wrong)
+    check_result(plain, where)
 
 
 def check_result(plain: dict[str, Any], where: str) -> None:
-    """Check that a result is consistent, else raise CalibrationFileError (code `contradiction`)."""
-    result, mount = plain["result"], plain["mount"]
-    matrix, quaternion, translation, covariance = (
-        np.array(value, float)
-        for value in (
-            result["matrix"],
-            result["rotation_xyzw"],
-            result["translation_m"],
-            plain["covariance"],
-        )
-    )
-    parent = "flange" if mount == "eye-in-hand" else "base"
-    wrong = ""
-    if (result["parent_frame"], result["child_frame"]) != (parent, "camera"):
-        wrong = f"{mount} with {result['parent_frame']}_from_{result['child_frame']}"
-    elif matrix.shape != (4, 4) or not is_rigid(matrix) or abs(np.linalg.norm(quaternion) - 1) > 1e-6:
-        wrong = "the result is not a rigid transform"
-    elif (
-        np.abs(matrix_from_quaternion(quaternion) - matrix[:3, :3]).max() > 1e-9
-        or np.abs(matrix[:3, 3] - translation).max() > 1e-12
-    ):
-        wrong = "matrix, translation and quaternion do not agree"
-    elif covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-        wrong = "the covariance is not 6 × 6 finite numbers"
-    else:
-        rounding = 1e-9 * float(np.abs(covariance).max())
-        asymmetry = np.abs(covariance - covariance.T).max()
-        if asymmetry > rounding or np.linalg.eigvalsh(covariance).min() < -rounding:
-            wrong = "the covariance is not symmetric and positive"
+    """Check that a result is consistent, else raise CalibrationFileError (code `contradiction`).
+
+    plain: whose fields are of the kinds that they must be of.
+    """
+    with np.errstate(all="ignore"):  # huge numbers end as a contradiction
+        wrong = _wrong_result(plain) or _wrong_arm(plain.get("arm_table"))
     if wrong:
         raise CalibrationFileError("contradiction", path=where, why=wrong)
+
+
+def _wrong_result(plain: dict[str, Any]) -> str:
+    """Say why X and its covariance cannot be; empty: they can."""
+    result, mount = plain["result"], plain["mount"]
+    parent = "flange" if mount == "eye-in-hand" else "base"
+    if (result["parent_frame"], result["child_frame"]) != (parent, "camera"):
+        return f"{mount} with {result['parent_frame']}_from_{result['child_frame']}"
+    matrix = _square(result["matrix"], 4)
+    quaternion = np.array(result["rotation_xyzw"], float)
+    if matrix is None or not is_rigid(matrix) or not abs(np.linalg.norm(quaternion) - 1) <= 1e-6:
+        return "the result is not a rigid transform"
+    turned = np.abs(matrix_from_quaternion(quaternion) - matrix[:3, :3]).max()
+    shifted = np.abs(matrix[:3, 3] - np.array(result["translation_m"], float)).max()
+    if not (turned <= 1e-9 and shifted <= 1e-12):
+        return "matrix, translation and quaternion do not agree"
+    covariance = _square(plain["covariance"], 6)
+    if covariance is None:
+        return "the covariance is not 6 × 6 finite numbers"
+    rounding = 1e-9 * float(np.abs(covariance).max())
+    asymmetry = np.abs(covariance - covariance.T).max()
+    if not asymmetry <= rounding or not _least_eigenvalue(covariance) >= -rounding:
+        return "the covariance is not symmetric and positive"
+    return ""
+
+
+def _square(rows: list[list[float]], size: int) -> Array | None:
+    """The rows as a matrix (size, size); None where they are another one, or not finite."""
+    if len(rows) != size or any(len(row) != size for row in rows):
+        return None
+    matrix = np.array(rows, float)
+    return matrix if np.isfinite(matrix).all() else None
+
+
+def _least_eigenvalue(symmetric: Array) -> float:
+    try:
+        return float(np.linalg.eigvalsh(symmetric).min())
+    except np.linalg.LinAlgError:
+        return math.nan
+
+
+def _wrong_arm(table: dict[str, Any] | None) -> str:
+    """Say why the corrected arm and its X cannot be; empty: they can."""
+    if table is None:
+        return ""
+    nominal = [table.get(key) is not None for key in ("nominal", "learned")]
+    corrected = [table.get(key) is not None for key in ("corrected", "corrected_chain")]
+    X = table.get("result")
+    frames = None if X is None else (X["parent_frame"], X["child_frame"])
+    known = frames in (("corrected_flange", "camera"), ("corrected_base", "camera"))
+    if not table["offered"] == known == (X is not None) or sum(nominal) != 1:
+        return "the corrected arm and its X do not belong together"
+    if corrected != (nominal if table["offered"] else [False, False]):
+        return "the corrected arm is of another kind than the nominal one"
+    return ""

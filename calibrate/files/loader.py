@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibrate.errors import CalibrationError, CalibrationFileError, InstallError
+from calibrate.errors import CalibrationError, InstallError
 from calibrate.files.folders import calibrations_folder, current_version, validity_of
-from calibrate.files.integrity import check_result, read_bounded, require_content_of_name, verified_plain
+from calibrate.files.integrity import check_plain, read_bounded, require_content_of_name, verified_plain
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, require_usable, time_text
 from recordings.files import MAIN_CAMERA
 from recordings.geometry import Array, Transform
@@ -61,7 +61,7 @@ class InstalledCalibration:
     """File of this version, which never changes."""
     validity: Validity
     plain: dict[str, Any]
-    """Content of the file as plain data."""
+    """Content of the file as plain data of today's format."""
 
     @cached_property
     def transform(self) -> Transform:
@@ -133,13 +133,8 @@ def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
     number, path = current_version(folder)
     content = read_bounded(path)
     plain = verified_plain(content, str(path))
+    check_plain(plain, str(path))
     require_content_of_name(path, content)
-    try:
-        check_result(plain, str(path))
-    except (KeyError, TypeError, ValueError) as problem:
-        raise CalibrationFileError(
-            "contradiction", path=path, why=f"{problem} is missing or of another kind"
-        ) from None
     return InstalledCalibration(camera, number, path, validity_of(folder, number), plain)
 
 

@@ -87,16 +87,6 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     result: FramePose | None = None
     """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera."""
 
-    def __post_init__(self) -> None:
-        frames = ("", "") if self.result is None else (self.result.parent_frame, self.result.child_frame)
-        known = frames in (("corrected_flange", "camera"), ("corrected_base", "camera"))
-        kinds = [arm is not None for arm in (self.nominal, self.learned)]
-        given = [arm is not None for arm in (self.corrected, self.corrected_chain)]
-        if not (self.offered == known == (self.result is not None)) or sum(kinds) != 1:
-            raise ValueError("the corrected arm and its X do not belong together")
-        if given != (kinds if self.offered else [False, False]):
-            raise ValueError("the corrected arm is of another kind than the nominal one")
-
     def base_from_flange(self, joints_rad: ArrayLike) -> Transform:
         """Compute corrected_base_from_corrected_flange of joints (n,).
 
@@ -141,5 +131,5 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
 def _chain(table: DhTable | None, chain: LearnedArm | None) -> Chain:
     if chain is not None:
         return Chain.of(chain)
-    assert table is not None  # one of them: `__post_init__`
+    assert table is not None  # one of them: by what is checked of every file (`files.integrity`)
     return chain_of(table)

@@ -112,7 +112,6 @@ class Views(msgspec.Struct, frozen=True):
     turned: list[int] = []
     """Views whose corner order was turned by 180° to agree with the others, and kept."""
     weights: list[ViewWeight] = []
-    """Files of earlier versions omit views of weight 1."""
 
 
 class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):

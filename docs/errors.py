@@ -74,7 +74,8 @@ def _rooms(package: str) -> dict[str, str]:
     found: dict[str, Counter[str]] = {}
     for path in sorted((ROOT / package).rglob("*.py")):
         room = path.relative_to(ROOT / package).parts[0]
-        for code in re.findall(r'"([a-z0-9]+(?:-[a-z0-9]+)*)"', path.read_text()):
+        source = re.sub(r'Field\("[^"]*"', "", path.read_text())  # fields of a file are no codes
+        for code in re.findall(r'"([a-z0-9]+(?:-[a-z0-9]+)*)"', source):
             found.setdefault(code, Counter())[ROOMS.get(room, OTHERS)] += 1
     return {code: rooms.most_common(1)[0][0] for code, rooms in found.items()}
 

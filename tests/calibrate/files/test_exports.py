@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.arms.chain import chain_of
 from calibrate.arms.kinematics import MODELS, DhTable, RobotModel, forward, table_of_axes, with_near_axes
-from calibrate.errors import CalibrationError, InstallError, UsageError
+from calibrate.errors import CalibrationError, CalibrationFileError, InstallError, UsageError
 from calibrate.files import exports
 from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration
 from calibrate.files.exports import FORMATS, FrameNames
@@ -321,5 +321,6 @@ def test_a_table_without_its_own_camera_is_a_contradiction(calibration: Calibrat
         "no table": {"corrected": None},
         "not offered": {"offered": False},
     }[change]
-    with pytest.raises(ValueError):
-        msgspec.structs.replace(arm, **replaced)
+    wrong = msgspec.structs.replace(calibration, arm_table=msgspec.structs.replace(arm, **replaced))
+    with raises("contradiction", CalibrationFileError):
+        decode_calibration(encode_calibration(wrong), "cell.yaml")

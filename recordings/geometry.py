@@ -217,15 +217,10 @@ def pose_from_quaternion(translation_m: ArrayLike, quaternion_xyzw: ArrayLike) -
     return pose(matrix_from_quaternion(quaternion_xyzw), translation_m)
 
 
-def pose_from_rotvec(translation_m: ArrayLike, rotvec_rad: ArrayLike) -> Array:
-    """Convert UR's convention, x, y, z [m] and a rotation vector [rad], to (..., 4, 4)."""
-    return pose(rotation_exp(rotvec_rad), translation_m)
-
-
 def pose_from_vector(vector: ArrayLike) -> Array:
     """Convert UR's six numbers (..., 6), x, y, z [m] and a rotation vector [rad], to (..., 4, 4)."""
     v = np.asarray(vector, dtype=float)
-    return pose_from_rotvec(v[..., :3], v[..., 3:])
+    return pose(rotation_exp(v[..., 3:]), v[..., :3])
 
 
 def vector_from_pose(matrix: Array) -> Array:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.geometry import pose_from_quaternion, pose_from_rotvec
+from recordings.geometry import pose_from_quaternion, pose_from_vector
 from station.devices.posts import read_declaration, read_post
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
@@ -94,7 +94,7 @@ def numbers() -> str:
     from scipy.spatial.transform import Rotation
 
     turned = Rotation.from_matrix(POSE[:3, :3])
-    hand = pose_from_rotvec([0.0, 0.0, 0.1034], [0.0, 0.0, -np.pi / 4])
+    hand = pose_from_vector([0.0, 0.0, 0.1034, 0.0, 0.0, -np.pi / 4])
     values = {
         "JOINTS": JOINTS,
         "DEGREES": np.degrees(JOINTS).tolist(),
@@ -129,7 +129,7 @@ def test_an_example_tells_the_flange_and_the_joints(name: str, tmp_path: Path) -
                 file.write(",".join(map(str, [*PLACE, *TURN, *JOINTS])) + "\n")
         post, pose = read_post(told.stdout.readline(), written)
         told.kill()
-    assert np.abs(pose_from_rotvec(pose[:3], pose[3:]) - POSE).max() < 1e-9
+    assert np.abs(pose_from_vector(pose) - POSE).max() < 1e-9
     assert post.t is not None and post.joints_rad == pytest.approx(JOINTS[: len(post.joints_rad or ())])
     assert len(post.joints_rad or ()) == (6 if name == "tell_ur.py" else 7)
     assert len((EXAMPLES / name).read_text().splitlines()) <= 60

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from calibrate.arms.kinematics import JOINT_NAMES
-from recordings.geometry import pose_from_rotvec
+from recordings.geometry import pose_from_vector
 from recordings.schema.messages import RobotState, Stillness
 from recordings.schema.stillness import LEAST_SAMPLES, scatter
 from station.cell.config import StillnessConfig
@@ -86,7 +86,7 @@ class StillnessMonitor:
         if len(window) < LEAST_SAMPLES or not covered or np.diff(times).max() > self._limits.window_s / 3:
             return None
         poses = np.array([s.tcp_pose for s in window])
-        position_m, rotation_rad = scatter(pose_from_rotvec(poses[:, :3], poses[:, 3:]))
+        position_m, rotation_rad = scatter(pose_from_vector(poses))
         return Stillness(
             window_s=float(times[-1] - times[0]),
             max_joint_speed_rad_s=max(fastest_rad_s(s) for s in window),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from recordings.geometry import interpolate, pose_from_rotvec, vector_from_pose
+from recordings.geometry import interpolate, pose_from_vector, vector_from_pose
 from recordings.schema.messages import RobotState, Stamps, Vector6
 from station.cell.clock_fit import ClockFit
 from station.cell.config import vector6
@@ -50,5 +50,5 @@ def _mix(first: Sequence[float], second: Sequence[float], fraction: float) -> tu
 def _mix_poses(first: Vector6, second: Vector6, fraction: float) -> Vector6:
     if first == second:
         return first
-    a, b = (pose_from_rotvec(vector[:3], vector[3:]) for vector in (first, second))
+    a, b = (pose_from_vector(vector) for vector in (first, second))
     return vector6(vector_from_pose(interpolate(a, b, fraction)))

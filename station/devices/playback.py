@@ -15,7 +15,7 @@ import numpy as np
 
 from recordings import strict_yaml
 from recordings.errors import RecordingError
-from recordings.geometry import pose_from_rotvec, vector_from_pose
+from recordings.geometry import pose_from_vector, vector_from_pose
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import (
     CameraIdentity,
@@ -149,7 +149,7 @@ class PlaybackRobot:
             raise StaleStateError("no-history")
         view = self._view if host_monotonic_ns >= self._since_ns else self._before
         tcp = self.identity.tcp_offset
-        tool = np.array(view.base_from_flange) @ pose_from_rotvec(tcp[:3], tcp[3:])
+        tool = np.array(view.base_from_flange) @ pose_from_vector(tcp)
         return RobotState(
             stamps=Stamps(
                 host_monotonic_ns=host_monotonic_ns,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calibrate.arms.kinematics import MODELS, forward
-from recordings.geometry import difference, pose_from_rotvec
+from recordings.geometry import difference, pose_from_vector
 from recordings.images import encode_png
 from recordings.schema.messages import (
     CameraIdentity,
@@ -79,8 +79,8 @@ async def test_robot_and_camera_stand_where_the_recorded_ones_stood(recording: P
         await robot.move(STARTS[number], 0.6, 1.0)
         state = robot.state()
         assert np.allclose(state.joints_rad, STARTS[number]) and not any(state.joint_speeds_rad_s)
-        base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
-        expected = forward(MODELS["UR10"], STARTS[number]) @ pose_from_rotvec(TCP[:3], TCP[3:])
+        base_from_tcp = pose_from_vector(state.tcp_pose)
+        expected = forward(MODELS["UR10"], STARTS[number]) @ pose_from_vector(TCP)
         assert np.abs(difference(base_from_tcp, expected)).max() < 1e-9
         assert np.array_equal((await camera.capture()).pixels, image(number))
     await robot.close()

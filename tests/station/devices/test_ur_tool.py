@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from calibrate.arms.kinematics import MODELS, RobotModel, forward
-from recordings.geometry import pose_from_rotvec, rotation_log
+from recordings.geometry import pose_from_vector, rotation_log
 from recordings.schema.messages import RobotState, Vector6
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
@@ -39,7 +39,7 @@ FACTORY = UR10.calibrated(
 
 def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
     """Give what a controller with this arm reports."""
-    T = forward(arm, joints_rad) @ pose_from_rotvec(tool[:3], tool[3:])
+    T = forward(arm, joints_rad) @ pose_from_vector(tool)
     pose = tuple(np.concatenate([T[:3, 3], rotation_log(T[:3, :3])]).tolist())
     return msgspec.structs.replace(PLAYING, joints_rad=joints_rad, tcp_pose=pose)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibrate.arms.kinematics import MODELS, forward
-from recordings.geometry import pose_from_rotvec, rotation_log
+from recordings.geometry import pose_from_vector, rotation_log
 from recordings.schema.messages import Image, RobotIdentity, RobotState, Stamps, Vector6
 from station.cell.errors import RobotError
 from station.cell.status import StationState as S
@@ -22,7 +22,7 @@ async def test_a_tool_on_the_pendant_is_not_in_the_pose(rig: Rig, monkeypatch: p
 
     def with_tool() -> RobotState:
         state = bare()
-        tip = forward(MODELS["UR10"], state.joints_rad) @ pose_from_rotvec(TOOL[:3], TOOL[3:])
+        tip = forward(MODELS["UR10"], state.joints_rad) @ pose_from_vector(TOOL)
         x, y, z, rx, ry, rz = np.concatenate([tip[:3, 3], rotation_log(tip[:3, :3])]).tolist()
         return msgspec.structs.replace(state, tcp_pose=(x, y, z, rx, ry, rz))
 

@@ -7,7 +7,9 @@ of limits and docs/reference/gates.md (`make pages`) take all gates from here.
 To add one:
   1. Compute the figure in `handeye/metrics.py`; test it in tests/calibrate/handeye/test_metrics.py.
   2. Make it a field of `Judgement` in `handeye/solution.py`, or of `results.QualityFigures` where the file is
-     to hold it, too. Fill it in `handeye/describe.py`; for the paper's profile in `handeye/paper_profile.py`.
+     to hold it, too (with a row in `files/fields.py`). Fill it in `handeye/describe.py`; for the paper's
+     profile in `handeye/paper_profile.py`.
+     Joints are `handeye.arm.recorded_joints(views)`: those of `CellFit.arm` may be computed from poses.
      The solver sees no pictures: a figure of a picture is first a field of `views.BoardView`, filled in
      `recorded_views.py` (of a recording) and `pictures.py` (of pictures that a program gives).
   3. Here add its limit and its figure; `unit` is a key of `results.UNITS_SHOWN`. A gate without a value has

@@ -11,17 +11,19 @@ From a person to the wire, by files and functions in `station/` (tests/test_page
     `cli/__init__.py:main`, `protocol/stop_client.py:main, stop_and_tell, stop, _send_and_watch, send_stop`.
   In the daemon: approval and run end, the state is STOPPED, the arm is stopped.
     `server/stop_server.py:StopServer._woken, _read, _carry_out`,
-    `server/dispatch.py:SessionDispatcher.stop_by_datagram`, `session/session.py:Session.stop, _halt,
-    _stop_arm`, `devices/ur/robot.py:UrRobot.stop, StopPaths.stop`. The socket is also read at the beginning
-    of every round of the session: `session/supervisor.py:SessionSupervisor._round`,
+    `server/dispatch.py:SessionDispatcher.stop_by_datagram, _to_the_end` (a task of the event loop, which
+    begins at its next turn), `session/session.py:Session.stop, _halt, _stop_arm`,
+    `devices/ur/robot.py:UrRobot.stop, StopPaths.stop`. The socket is also read at the beginning of every
+    round of the session: `session/supervisor.py:SessionSupervisor._round`,
     `server/stop_server.py:StopServer.round`.
-  From there by two ways at once; neither waits for the other:
-    The robot's dashboard: b"stop\\n" to port 29999, also where the station has no control.
-      `devices/ur/dashboard.py:Dashboard.send`.
+  From there by two ways, one right after the other; neither waits for an answer of the other:
     The control process: {"do": "stop", "deceleration": 4.0} on its socket, rad/s²; it calls stopJ(4.0) of
       ur_rtde, or of the station's own script, which gets an RTDE data packet (type "U") with the command
       STOP: stopj(4.0) where it moves, then halt. `devices/ur/child.py:ControlChild.stop, _send`,
-      `devices/ur/control.py:MotionServer.serve`, `devices/ur/script.py:ScriptControl.stopJ`.
+      `devices/ur/control.py:MotionServer.serve`, `devices/ur/script.py:ScriptControl.stopJ, _write`,
+      `devices/rtde.py:Recipe.pack`.
+    The robot's dashboard: b"stop\\n" to port 29999, also where the station has no control.
+      `devices/ur/dashboard.py:Dashboard.send`.
   Where the dashboard does not answer "Stopped" within 50 ms it is asked once more, on a new connection. The
     control process is killed once it answered, at most 0.1 s after STOP; a program that it left playing is
     stopped.

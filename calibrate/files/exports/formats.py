@@ -1,13 +1,14 @@
 """The formats of `calibrate export`: a function below `@export_format` is one.
 
-Its name is the format's, `_` for `-`. The first line of its docstring is its help, the rest tells what the
-file holds; the command and docs/reference/formats.md (`make pages`) take them from there. `vision.zivid` is a
-short example; one with names of frames is `ros.ros_launch`. A new module is imported in
-`exports/__init__.py`.
+Its name is the format's, `_` for `-`; one that Python or a library has taken gets a longer name. The first
+line of its docstring is its help, the rest tells what the file holds; the command and
+docs/reference/formats.md (`make pages`) take them from there. `vision.zivid` is a short example; one with
+names of frames is `ros.ros_launch`. A new module is imported in `exports/__init__.py`.
 
 It is given the calibration and the names of frames. The camera's place is `calibration.transform.matrix`,
 the optical frame in its parent, (4, 4) in metres; its lens `calibration.intrinsics.model`. It returns the
-file's text, which holds `frames.comment` as a comment or a text of its own. A reader in
+file's text with all digits of the numbers, and with the text of `comment(calibration, frames)` (of
+`exports/frames.py`): as a comment, or where the format has none as a field of its own. A reader in
 `READERS` of tests/calibrate/files/test_exports.py finds the camera's place by the other program's own rule.
 A library that reads the format judges it in tests/foreign/test_exports.py and is pinned in its
 requirements.txt. Every test of test_exports.py runs on all formats and both mountings. XML is written with

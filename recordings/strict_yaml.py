@@ -65,17 +65,26 @@ class _Loader(yaml.CSafeLoader):  # type: ignore[misc]  # yaml has no types
 _WHOLE = r"[-+]?(0|[1-9][0-9]*)"
 """No leading zero: a serial number 0128 is text, as it is to the YAML 1.1 that Python's programs write. With
 a point it is a number: 0012.5."""
-for _tag, _pattern in (
+_SCALARS = (
     ("null", r"~|null|Null|NULL|"),
     ("bool", r"true|True|TRUE|false|False|FALSE"),
     ("int", _WHOLE),
     ("float", rf"({_WHOLE}|[-+]?([0-9]+\.[0-9]*|\.[0-9]+))([eE][-+]?[0-9]+)?|(?i:[-+]?\.inf|\.nan)"),
-):
+)
+for _tag, _pattern in _SCALARS:
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), None)
 _Loader.add_constructor(
     "tag:yaml.org,2002:float",
     lambda _, node: float(node.value.lower().replace(".inf", "inf").replace(".nan", "nan")),
 )
+
+
+class Dumper(yaml.CSafeDumper):  # type: ignore[misc]  # yaml has no types
+    """For `yaml.dump`: quotes texts that are numbers to the readers here, but not to PyYAML, such as 12e4."""
+
+
+for _tag, _pattern in _SCALARS:
+    Dumper.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), None)
 
 
 def _refuse_traps(content: bytes, limit: int) -> None:

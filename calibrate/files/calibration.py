@@ -36,6 +36,7 @@ from calibrate.results import (
     ViewQuality,
     Views,
 )
+from recordings import strict_yaml
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.geometry import Transform as Transform
 from recordings.plain_text import plain_data
@@ -204,7 +205,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
     ordered["sha256"] = content_sha256(ordered)
     text: str = yaml.dump(
         ordered,
-        Dumper=yaml.CSafeDumper,
+        Dumper=strict_yaml.Dumper,
         sort_keys=False,
         default_flow_style=None,
         width=120,

@@ -20,7 +20,7 @@ from calibrate.views.view_set import board_in_camera
 from recordings.files import ASKED_FOR, read_file, write_atomically
 from recordings.geometry import Array, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
-from recordings.strict_yaml import LIMIT_BYTES
+from recordings.strict_yaml import LIMIT_BYTES, Dumper
 from station.analysis.found_cell import FoundCell
 from station.cell.config import (
     CameraConfig,
@@ -198,7 +198,7 @@ def config_text(config: StationConfig) -> str:
         "board_guess": f"{parents[1]}_from_board, from the guided views, 1 sigma below",
         "board": _COUNTED[config.board.kind],
     }
-    text = yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=200)
+    text = yaml.dump(plain, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=200)
     lines = [
         f"{line}   # {notes[key]}" if (key := line.partition(":")[0].strip()) in notes else line
         for line in text.splitlines()

@@ -9,10 +9,10 @@ from typing import Literal
 import msgspec
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from recordings.strict_yaml import StrictYamlError, load, load_plain
+from recordings.strict_yaml import Dumper, StrictYamlError, load, load_plain
 
 
 class Colour(StrEnum):
@@ -112,3 +112,14 @@ def test_a_part_of_a_larger_file_is_read_with_the_files_lines() -> None:
     assert load(b"kind: b", Chosen, "kind_of_thing") == Chosen("b"), "a file of its own"
     with pytest.raises(StrictYamlError, match=r"line 3: part\.kin: unknown key; did you mean 'kind'"):
         load(b"x: 1\npart:\n  kin: b\n", Chosen, "part")
+
+
+@settings(max_examples=500)
+@given(st.text(alphabet="0123456789+-.eExo_:~naifNul", min_size=1, max_size=8))
+@example("12e4")
+@example("-.5")
+@example("1.e3")
+def test_a_text_that_looks_like_a_number_stays_a_text(text: str) -> None:
+    """Serial numbers do: 12e4 is text to PyYAML, and a number to whom reads the file."""
+    written = yaml.dump({"serial": text}, Dumper=Dumper)
+    assert load_plain(written.encode()) == {"serial": text}

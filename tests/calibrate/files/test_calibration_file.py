@@ -128,6 +128,16 @@ def test_a_device_that_orders_the_terminal_about_is_written_so_that_it_reads_bac
     assert installed_calibration(tmp_path / "s").robot.serial == robot.serial
 
 
+@pytest.mark.parametrize("serial", ["12e4", "1.e3", "-.5", "0128", "null", "1:30"])
+def test_a_serial_number_that_looks_like_another_value_reads_back(
+    solved_real: SolvedRecording, serial: str
+) -> None:
+    good = solved_real.calibration
+    robot = msgspec.structs.replace(good.robot, serial=serial)
+    content = encode_calibration(msgspec.structs.replace(good, robot=robot))
+    assert decode_calibration(content, "x").robot.serial == serial
+
+
 def test_a_recording_of_before_with_such_a_device_solves_to_a_file_that_reads_back(
     tmp_path: Path,
 ) -> None:

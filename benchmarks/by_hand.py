@@ -28,13 +28,12 @@ from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views.projection import camera_matrix, distortion, project
-from calibrate.views.view_set import BoardView, ViewSet
+from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from recordings.schema.stillness import WINDOW_S, scatter
 from station.analysis.estimation import quick_covariance
 from station.analysis.guidance import NextView, next_view, rim, way_to
-from station.analysis.worker import CapturedView
 from station.cell.config import CaptureConfig, StillnessConfig
 from station.cell.status import FEWEST_BY_HAND
 from tests.calibrate.chains import CAMERA, HOME, POINTS, ArmCell, arm_cell, boards, in_sight, shows, views_at
@@ -90,12 +89,12 @@ def session(task: tuple[str, Mount, int]) -> tuple[float, ...]:
         for at in np.flatnonzero(still(cell, path, C) * shows(C)):
             Y = cell.Y @ pose(np.eye(3), shift_m[at])
             (view,) = views_at(cell.arm, mount, cell.X, Y, cell.link_errors, rng, path[at : at + 1])
-            if way_to(wanted, seen(view)).new:
+            if way_to(wanted, view).new:
                 kept, moving = replace(view, index=len(taken)), moving + int(speed_m_s[at] > MOVING_M_S)
                 break
         given_up = [*given_up, wanted.camera_from_board] if kept is None else []
         taken = replace(taken, views=taken.views if kept is None else (*taken.views, kept))
-        wanted = next_view(mount, BOARD, blank, False, [seen(view) for view in taken], given_up)
+        wanted = next_view(mount, BOARD, blank, False, taken.views, given_up)
     q = anywhere(cell, rng, len(taken))
     by_chance = views_at(cell.arm, mount, cell.X, cell.Y, cell.link_errors, rng, q)
     return float(len(taken)), float(moves), float(moving), error_mm(taken, cell), error_mm(by_chance, cell)
@@ -107,10 +106,6 @@ def enough(taken: ViewSet, wanted: NextView) -> bool:
     covariance = quick_covariance(found, BOARD, True)
     distance_m = median_distance_m(found.views.camera_from_board)
     return point_error_m(found.X, covariance, distance_m) <= CaptureConfig().goal_m
-
-
-def seen(view: BoardView) -> CapturedView:
-    return CapturedView(view.index, view.base_from_flange, np.arange(len(POINTS)), view.pixels)
 
 
 def error_mm(views: ViewSet, cell: ArmCell) -> float:

@@ -79,9 +79,9 @@ def untouched(task: tuple[Mount, int]) -> list[bool]:
     for k in range(EARLIER_PICTURES + NEW_PICTURES):
         wander = np.r_[2e-5 * rng.normal(size=3), np.zeros(3)]
         (view,) = later_views(cell, wander, 1000 * seed + k, 1)
-        assert view.pixels is not None
         blur = rng.normal(size=2) * (k % 20 == 0)
-        pictures.append(replace(view, board_points=view.board_points[four], pixels=view.pixels[four] + blur))
+        few = view.corners.part(four)
+        pictures.append(replace(view, corners=replace(few, pixels=few.pixels + blur)))
     taken = without_joints(replace(cell.views, views=tuple(pictures)))
     earlier = EarlierPictures.of(taken.select(list(range(EARLIER_PICTURES))), known)
     ends = range(EARLIER_PICTURES + NEWEST[-1], len(pictures) + 1)

@@ -17,6 +17,7 @@ from calibrate.arms.kinematics import MODELS, forward
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
+from calibrate.views.corners import Corners
 from calibrate.views.projection import project
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
@@ -107,7 +108,7 @@ def imperfect_cell(
     sigma = np.repeat([noise.robot_m, noise.robot_rad], 3)
     flange = perturb(told, sigma * rng.normal(size=(views, 6)))
     seen = tuple(
-        BoardView(i, f"view {i}", flange[i], stated, pixels[i], joints[i] if known.joints else None)
+        BoardView(i, f"view {i}", flange[i], Corners(stated, pixels[i]), joints[i] if known.joints else None)
         for i in range(views)
     )
     given = _told(rng, wrong, lens) if known.lens else CameraModel(lens.width, lens.height)

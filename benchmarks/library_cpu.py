@@ -30,7 +30,7 @@ def pairs_without_corners(cell: SceneCell) -> None:
 
 
 def corners_through_a_known_lens(cell: SceneCell) -> None:
-    corners = [view.pixels for view in cell.views]
+    corners = [view.corners.pixels for view in cell.views]
     calibrate.solve(corners, cell.views.base_from_flange, "7x6 25", "eye-in-hand", cell.camera)
 
 

@@ -179,10 +179,10 @@ def _shuffle(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoi
 def _turn(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
     changed = []
     for view in (cell.views.views[i] for i in bad):
-        turn = pose(rotation_exp([0, 0, np.pi]), [*view.board_points[:, :2].max(axis=0), 0.0])
+        turn = pose(rotation_exp([0, 0, np.pi]), [*view.corners.points[:, :2].max(axis=0), 0.0])
         seen = np.asarray(view.camera_from_board) @ inverse(turn)
-        points = transform_points(turn, view.board_points)
-        changed.append(replace(view, board_points=points, camera_from_board=seen))
+        corners = replace(view.corners, points=transform_points(turn, view.corners.points))
+        changed.append(replace(view, corners=corners, camera_from_board=seen))
     return _views_wrong(cell, bad, changed, "")
 
 
@@ -233,8 +233,10 @@ def _change_tcp(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> S
 def _refocus(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
     factor = 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.06)
     centre = np.array(cell.lens.matrix)[:2, 2]
-    views = (cell.views.views[i] for i in bad)
-    changed = (replace(view, pixels=centre + factor * (view.pixels - centre)) for view in views)
+    changed = []
+    for view in (cell.views.views[i] for i in bad):
+        pixels = centre + factor * (view.corners.pixels - centre)
+        changed.append(replace(view, corners=replace(view.corners, pixels=pixels)))
     spoilt = solve_pnp(_with(cell.views, bad, changed), BOARD)
     return Spoilt(spoilt, cell.X, _longer(bad), Reading.REFOCUSED)
 

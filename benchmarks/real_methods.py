@@ -111,8 +111,8 @@ def opencv_lens(views: ViewSet) -> CameraModel:
     """`cv2.calibrateCamera` with its own defaults."""
     unknown: Array = None  # type: ignore[assignment]
     _, K, D, _, _ = cv2.calibrateCamera(
-        [view.board_points.astype(np.float32) for view in views],
-        [view.pixels.astype(np.float32) for view in views],
+        [view.corners.points.astype(np.float32) for view in views],
+        [view.corners.pixels.astype(np.float32) for view in views],
         (views.camera.width, views.camera.height),
         unknown,
         unknown,
@@ -146,8 +146,8 @@ def calibration_rs(views: ViewSet) -> dict[str, Answer]:
 def _observation(view: BoardView) -> rs.SingleCamHandeyeView:
     F = view.base_from_flange
     pose = rs.Pose(tuple(quaternion_from_matrix(F[:3, :3]).tolist()), tuple(F[:3, 3].tolist()))
-    points = [tuple(point) for point in view.board_points.tolist()]
-    pixels = [tuple(pixel) for pixel in view.pixels.tolist()]
+    points = [tuple(point) for point in view.corners.points.tolist()]
+    pixels = [tuple(pixel) for pixel in view.corners.pixels.tolist()]
     return rs.SingleCamHandeyeView(rs.Observation(points, pixels), pose)
 
 
@@ -159,7 +159,7 @@ def _camera(views: ViewSet, K: Array, D: Array) -> CameraModel:
 
 def board_centre(views: ViewSet) -> Array:
     """(3,) middle of the board's points in `board`."""
-    points = np.concatenate([view.board_points for view in views])
+    points = np.concatenate([view.corners.points for view in views])
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
@@ -172,15 +172,15 @@ def predicted_centre(views: ViewSet, place: int, answer: Answer) -> Array:
 
 def view_pnp(view: BoardView, answer: Answer) -> Array:
     """camera_from_board of one view by its own corners: the better of the plane's two poses, refined."""
-    points = answer.shape(view.board_points)
+    points = answer.shape(view.corners.points)
     K, D = np.array(answer.camera.matrix), np.array(answer.camera.distortion)
     flat = np.ascontiguousarray(points * [1.0, 1.0, 0.0])
-    _, rotations, shifts, _ = cv2.solvePnPGeneric(flat, view.pixels, K, D, flags=cv2.SOLVEPNP_IPPE)
+    _, rotations, shifts, _ = cv2.solvePnPGeneric(flat, view.corners.pixels, K, D, flags=cv2.SOLVEPNP_IPPE)
     best, best_square = np.eye(4), np.inf
     for first_r, first_t in zip(rotations, shifts, strict=True):
-        r, t = cv2.solvePnPRefineLM(points, view.pixels, K, D, first_r.copy(), first_t.copy())
+        r, t = cv2.solvePnPRefineLM(points, view.corners.pixels, K, D, first_r.copy(), first_t.copy())
         shown, _ = cv2.projectPoints(points, r, t, K, D)
-        square = float(np.square(shown[:, 0] - view.pixels).sum())
+        square = float(np.square(shown[:, 0] - view.corners.pixels).sum())
         if square < best_square:
             best_square = square
             best[:3, :3], best[:3, 3] = cv2.Rodrigues(r)[0], t.ravel()

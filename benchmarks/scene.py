@@ -13,6 +13,7 @@ import numpy as np
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
+from calibrate.views.corners import Corners
 from calibrate.views.projection import project
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import (
@@ -82,7 +83,9 @@ def make_cell(
     measured = perturb(flange, rng.normal(size=(views, 6)) * sigma)
     exact = project(camera, transform_points(C, board)).pixels
     pixels = exact + rng.normal(size=exact.shape) * noise.corner_px
-    seen = tuple(BoardView(i, f"view {i}", measured[i], board, pixels[i], None, C[i]) for i in range(views))
+    seen = tuple(
+        BoardView(i, f"view {i}", measured[i], Corners(board, pixels[i]), None, C[i]) for i in range(views)
+    )
     found = ViewSet(mount, seen, camera)
     if refit_camera:
         found = replace(found, camera=calibrate_intrinsics(found).camera)

@@ -13,6 +13,8 @@ from calibrate.boards.corners import Grey, to_grey
 from calibrate.boards.grids import find_chessboard, find_circles, other_size
 from calibrate.boards.markers import NOTHING, find_april_grid, find_charuco, find_tag
 from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
+from calibrate.views.corners import Corners
+from recordings.files import MAIN_CAMERA
 from recordings.geometry import Array
 from recordings.images import Pixels
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
@@ -43,10 +45,8 @@ class Detection:
     """Cause for a program; empty when the board was found."""
     reason: str
     """The cause for people."""
-    indices: NDArray[np.intp]
-    """(k,) rows of `board_points`"""
-    pixels: Array
-    """(k, 2)"""
+    corners: Corners
+    """Those found, in pixels of this image; none where the board was not found."""
     expected: int
     """Points of the whole board."""
     width: int
@@ -60,33 +60,38 @@ class Detection:
     def found(self) -> bool:
         return not self.cause
 
-    @property
-    def corners(self) -> int:
-        return len(self.indices)
 
-
-def detect(image: Pixels, spec: BoardSpec, thorough: bool = True, exhaustive: bool = True) -> Detection:
+def detect(
+    image: Pixels,
+    spec: BoardSpec,
+    thorough: bool = True,
+    exhaustive: bool = True,
+    camera: str = MAIN_CAMERA,
+) -> Detection:
     """Find the board to sub-pixel accuracy.
 
     image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the
-    search for the reason (previews), `exhaustive=False` the slowest and that search. Raises BoardError for an
-    impossible board; an image without a board is an answer, not an error.
+    search for the reason (previews), `exhaustive=False` the slowest and that search. `camera`: name of the
+    one that took the image. Raises BoardError for an impossible board; an image without a board is an answer,
+    not an error.
     """
     check_board(spec)
     grey = to_grey(image)
-    expected = len(board_points(spec))
+    points = board_points(spec)
+    expected = len(points)
     height, width = grey.shape
     indices, pixels = _find(grey, spec, thorough, exhaustive)
     fewest = min(FEWEST_POINTS, expected)
     whole = len(indices) == expected
-    found = whole or (len(indices) >= fewest and fixes_a_plane(board_points(spec)[indices]))
+    found = whole or (len(indices) >= fewest and fixes_a_plane(points[indices]))
     cause: Cause
     cause, reason = ("", "") if found else _reason(grey, spec, len(indices), fewest, thorough and exhaustive)
     if not found:
         indices, pixels = indices[:0], pixels[:0]
     area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if found else 0.0
     share = area / (width * height)
-    return Detection(cause, reason, indices, pixels, expected, width, height, _saturated(grey, pixels), share)
+    corners = Corners(points[indices], pixels, indices, camera=camera)
+    return Detection(cause, reason, corners, expected, width, height, _saturated(grey, pixels), share)
 
 
 def _find(

@@ -17,6 +17,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.reprojection import bent_points
 from calibrate.lens.pnp import candidate_poses
+from calibrate.views.corners import Corners
 from calibrate.views.view_set import BoardView, ViewSet, observe_views
 from recordings.geometry import Array, difference, inverse, skew
 
@@ -77,7 +78,7 @@ def found_points(calibration: Calibration) -> Array:
     points, found = board_points(calibration.board), calibration.quality.board
     if found is None:
         return points
-    whole = BoardView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
+    whole = BoardView(0, "", np.eye(4), Corners(points, np.zeros((len(points), 2))))
     observed = observe_views(ViewSet(calibration.mount, (whole,), calibration.intrinsics.model))
     return np.asarray(bent_points(observed, found.numbers)[0])
 

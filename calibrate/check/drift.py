@@ -123,7 +123,7 @@ def check_drift(views: ViewSet, known: KnownCell) -> DriftCheck:
             counted=f"{len(views)} views for a drift check",
             advice="Capture more: station drift-check.",
         )
-    if not any(len(view.pixels) for view in views):  # such board poses have errors that nobody stated
+    if not any(len(view.corners) for view in views):  # such board poses have errors that nobody stated
         raise BadViewsError("no-corners")
     known = known.beside(views)
     observed, prior = known.observe(views), known.prior(camera_may_have_moved=True)

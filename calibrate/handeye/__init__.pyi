@@ -11,5 +11,6 @@ from .solution import Judgement as Judgement
 from .solution import Solution as Solution
 from .solution import SolveOptions as SolveOptions
 from .solve import BoardView as BoardView
+from .solve import Corners as Corners
 from .solve import ViewSet as ViewSet
 from .solve import solve_views as solve_views

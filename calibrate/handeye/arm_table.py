@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from calibrate.arms.chain import Chain, LearnedArm, chain_of
 from calibrate.arms.kinematics import DhTable
 from calibrate.errors import CalibrationFileError
-from calibrate.views.view_set import array_of
+from calibrate.views.arrays import array_of
 from recordings.geometry import Array, Transform
 from recordings.schema.messages import Matrix4
 

@@ -64,7 +64,9 @@ def boards_own_motion(flange: Array, boards: Array, extent_m: float = 0.0) -> Bo
 def board_extent_m(views: ViewSet) -> float:
     """Diagonal of the board as far as any view shows it; 0 of pairs without corners."""
     sizes = [
-        float(np.linalg.norm(np.ptp(view.board_points, axis=0))) for view in views if len(view.board_points)
+        float(np.linalg.norm(np.ptp(view.corners.points, axis=0)))
+        for view in views
+        if len(view.corners.points)
     ]
     return max(sizes, default=0.0)
 

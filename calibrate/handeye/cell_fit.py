@@ -182,9 +182,9 @@ def set_boards_right(views: ViewSet, X: Array, Y: Array) -> tuple[ViewSet, tuple
 
 def _turns(view: BoardView) -> list[Array]:
     """List the rotations of the board onto itself: by 180°, and by ±90° where it is square."""
-    if not len(view.board_points):
+    if not len(view.corners.points):
         return []
-    low, high = view.board_points.min(axis=0), view.board_points.max(axis=0)
+    low, high = view.corners.points.min(axis=0), view.corners.points.max(axis=0)
     centre = (low + high) / 2
     square = abs((high - low)[0] - (high - low)[1]) < 1e-9
     turns = []
@@ -197,6 +197,6 @@ def _turns(view: BoardView) -> list[Array]:
 def _turned(view: BoardView, turn: Array) -> BoardView:
     return replace(
         view,
-        board_points=transform_points(turn, view.board_points),
+        corners=replace(view.corners, points=transform_points(turn, view.corners.points)),
         camera_from_board=np.asarray(view.camera_from_board) @ inverse(turn),
     )

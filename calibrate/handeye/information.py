@@ -20,8 +20,9 @@ from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.results import SHAPE
+from calibrate.views.arrays import array_of
 from calibrate.views.projection import camera_matrix
-from calibrate.views.view_set import Observations, array_of, board_in_camera, extent_of, require_mount
+from calibrate.views.view_set import Observations, board_in_camera, extent_of, require_mount
 from recordings.geometry import Array
 from recordings.schema.messages import CameraModel, Mount
 

@@ -109,7 +109,7 @@ def require_solvable(views: ViewSet) -> None:
         )
     if len(views) > MAX_VIEWS:
         raise BadViewsError("too-many-views", views=len(views), limit=MAX_VIEWS)
-    fewest = FEWEST_CORNERS_IN_VIEW if any(len(view.pixels) for view in views) else 0
+    fewest = FEWEST_CORNERS_IN_VIEW if any(len(view.corners) for view in views) else 0
     if views.camera.matrix is not None or fewest:
         camera_matrix(views.camera)
         distortion(views.camera)
@@ -122,7 +122,7 @@ def require_solvable(views: ViewSet) -> None:
 
 
 def _require_view(view: BoardView, fewest_corners: int) -> None:
-    T, corners, points = np.array(view.camera_from_board), len(view.pixels), len(view.board_points)
+    T, corners, points = np.array(view.camera_from_board), len(view.corners), len(view.corners.points)
 
     def require(right: bool, code: str, **values: Value) -> None:
         if not right:
@@ -133,11 +133,11 @@ def _require_view(view: BoardView, fewest_corners: int) -> None:
     # told without pictures, it may be in a camera whose axes are not optical
     in_front = bool(T[2, 3] > 0) or not fewest_corners
     require(is_rigid(T) and in_front, "board-pose")
-    finite = np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()
+    finite = np.isfinite(view.corners.pixels).all() and np.isfinite(view.corners.points).all()
     right = bool(fewest_corners <= corners == points and finite)
     require(right, "corners", corners=corners, points=points, minimum=fewest_corners)
     if corners:
-        away = view.board_points - np.mean(view.board_points, axis=0)
+        away = view.corners.points - np.mean(view.corners.points, axis=0)
         require(bool(np.linalg.matrix_rank(away) > 1), "corners-in-line")
 
 
@@ -193,7 +193,7 @@ def distance_in_sigmas(X: Array, reference: Array, covariance: Array) -> float:
 
 def picture_coverage(views: Sequence[BoardView], camera: CameraModel) -> float:
     """Compute the share of the picture inside the outlines of the boards seen; 0 without corners."""
-    corners = [view.pixels for view in views if len(view.pixels)]
+    corners = [view.corners.pixels for view in views if len(view.corners)]
     if not corners:
         return 0.0
     scale = 64 / max(camera.width, camera.height)

@@ -170,7 +170,7 @@ _SETTLED = 0.3
 
 @dataclass(frozen=True, eq=False)
 class PoseViews:
-    """The recording with each image reduced to a board pose."""
+    """The recording with each image reduced to a board pose: made of a `ViewSet`, it holds no corners."""
 
     mount: Mount
     flange: Array

@@ -38,10 +38,11 @@ from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.readings import CHANGES, explain_changes, explain_recording, explain_text
 from calibrate.handeye.solution import Explanation, Reading, Solution, SolveOptions
 from calibrate.results import Remark
+from calibrate.views.arrays import array_of
+from calibrate.views.corners import Corners as Corners
 from calibrate.views.projection import intrinsics_names
 from calibrate.views.view_set import BoardView as BoardView
 from calibrate.views.view_set import ViewSet as ViewSet
-from calibrate.views.view_set import array_of
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 

@@ -18,13 +18,14 @@ from calibrate.boards.corners import Grey, to_grey
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.grids import count_circles, seen_size
 from calibrate.boards.markers import marker_detector
-from calibrate.boards.model import board_points, usual_markers
+from calibrate.boards.model import usual_markers
 from calibrate.errors import CalibrationError
 from calibrate.imported.charuco import DICTIONARIES, layouts, markers_in_squares
 from calibrate.imported.described import Described, described
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import Candidate, candidate_poses
-from calibrate.views.view_set import NO_CORNERS, BoardView, ViewSet
+from calibrate.views.corners import NO_CORNERS, Corners
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.errors import ImportSourceError
 from recordings.files import read_file
 from recordings.image_headers import IMAGE_LIMIT_BYTES, ImageError, read_header
@@ -84,7 +85,7 @@ def told_boards(table: Table) -> Iterator[Seen]:
     for how, evidence in possible(table.numbers):
         poses = how.poses(table.numbers[rows])
         views: dict[Key, BoardView] = {
-            row: BoardView(row, f"row {row + 1}", np.eye(4), *NO_CORNERS, camera_from_board=T)
+            row: BoardView(row, f"row {row + 1}", np.eye(4), NO_CORNERS, camera_from_board=T)
             for row, T in zip(rows, poses, strict=True)
         }
         candidates: dict[Key, list[Candidate]] = {
@@ -131,19 +132,11 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
     for each in sorted(likely, key=_Tried.rank)[:2]:
         board = each.board
         known = each.known
-        points = board_points(board)
         found = dict(_search(small, board, known, progress))
         if given is None and board.kind is BoardKind.CHESSBOARD:
             board, found = _with_its_markers(held, board, found, small, progress)
-            points = board_points(board)
         views: dict[Key, BoardView] = {
-            path: BoardView(
-                n,
-                path.name,
-                np.eye(4),
-                points[found[path].indices],
-                (found[path].pixels + 0.5) / factor - 0.5,
-            )
+            path: BoardView(n, path.name, np.eye(4), _of_full_size(found[path].corners, factor))
             for n, path in enumerate(images)
             if path in found
         }
@@ -181,7 +174,7 @@ def _with_its_markers(
     ImportSourceError where there are markers in its squares, and no board of them is found.
     """
     shown = [*found][:: max(1, len(found) // _TRIED)]
-    markers = markers_in_squares(board, [(images[path], found[path].pixels) for path in shown])
+    markers = markers_in_squares(board, [(images[path], found[path].corners.pixels) for path in shown])
     if markers is None:
         return board, found
     few = [images[path] for path in shown][:_ANOTHER]
@@ -202,7 +195,7 @@ def _with_its_markers(
 def _corners(images: list[Grey], board: BoardSpec) -> int:
     """Corners of a board that are seen at a glance; 0 also where it has more markers than its dictionary."""
     try:
-        return sum(detect(image, board, thorough=False).corners for image in images)
+        return sum(len(detect(image, board, thorough=False).corners) for image in images)
     except CalibrationError:
         return 0
 
@@ -220,6 +213,10 @@ def _another(board: BoardSpec, boards: list[BoardSpec], images: list[Grey]) -> t
 
 def _reduced(image: Grey, factor: float) -> Grey:
     return np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+
+
+def _of_full_size(corners: Corners, factor: float) -> Corners:
+    return replace(corners, pixels=(corners.pixels + 0.5) / factor - 0.5)
 
 
 def _search(
@@ -284,7 +281,7 @@ def _likely(
         except CalibrationError:
             continue
         often = 2 * sum(found.found for found in seen) >= len(seen)
-        corners = sum(found.corners for found in seen)
+        corners = sum(len(found.corners) for found in seen)
         tried.append(_Tried(board, known, shown is None, corners, often))
         if often and known:
             break
@@ -310,7 +307,7 @@ def _camera(
     own: CameraModel | None = None
     with suppress(CalibrationError):
         own = calibrate_intrinsics(ViewSet("eye-in-hand", views, blank)).camera
-    for K, distortion in held.cameras[:1] if own is None or len(views[0].pixels) < 12 else ():
+    for K, distortion in held.cameras[:1] if own is None or len(views[0].corners) < 12 else ():
         matrix: Any = tuple(map(tuple, K.tolist()))
         return msgspec.structs.replace(blank, matrix=matrix, distortion=distortion), True
     return None if own is None else (own, False)

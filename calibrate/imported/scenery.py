@@ -86,7 +86,7 @@ def _by_tiles(shapes: list[_Shapes], black: Array) -> set[Mount]:
 def _shapes(grey: Grey, view: BoardView, camera: CameraModel) -> _Shapes:
     size = _WIDTH_PX, round(_WIDTH_PX * camera.height / camera.width)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    seen = ((view.pixels + 0.5) * _WIDTH_PX / camera.width - 0.5).astype(np.float32)
+    seen = ((view.corners.pixels + 0.5) * _WIDTH_PX / camera.width - 0.5).astype(np.float32)
     middle = seen.mean(axis=0)
     outline = middle + _CLEAR * (cv2.convexHull(seen)[:, 0] - middle)
     blurred = cv2.GaussianBlur(small, (0, 0), 1) - cv2.GaussianBlur(small, (0, 0), _FINE_PX)

@@ -69,7 +69,7 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
             dropped[used.views[k].index] = fits
         used = used.select(good)
     side, K = max(views.camera.width, views.camera.height), camera_matrix(lens)
-    rms_px = float(np.sqrt(np.average(view_rms_px**2, weights=[len(view.pixels) for view in used])))
+    rms_px = float(np.sqrt(np.average(view_rms_px**2, weights=[len(view.corners) for view in used])))
     if not (0.2 * side < K[0, 0] < 100 * side and rms_px <= 0.01 * side):
         raise BadViewsError(
             "no-lens-fits",
@@ -92,8 +92,8 @@ def _fit(views: ViewSet, model: LensModel) -> tuple[CameraModel, Array]:
 
 def _first_fisheye(views: ViewSet) -> CameraModel:
     """Start from OpenCV, which copes with boards at the edge of a wide image."""
-    object_points = [v.board_points.reshape(-1, 1, 3) for v in views]
-    pixels = [v.pixels.reshape(-1, 1, 2) for v in views]
+    object_points = [v.corners.points.reshape(-1, 1, 3) for v in views]
+    pixels = [v.corners.pixels.reshape(-1, 1, 2) for v in views]
     flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
     size = (views.camera.width, views.camera.height)
     try:
@@ -119,8 +119,8 @@ def fit_lens(views: ViewSet, start: CameraModel) -> tuple[CameraModel, Array]:
 def initial_camera(views: ViewSet) -> CameraModel:
     """Guess the focal length from the boards' shapes in the images; centre in the middle, no distortion."""
     size = (views.camera.width, views.camera.height)
-    points = [view.board_points.astype(np.float32) for view in views]
-    pixels = [view.pixels.astype(np.float32) for view in views]
+    points = [view.corners.points.astype(np.float32) for view in views]
+    pixels = [view.corners.pixels.astype(np.float32) for view in views]
     K = np.asarray(cv2.initCameraMatrix2D(points, pixels, size, 0), dtype=float)
     focal = np.where(np.isfinite(K[[0, 1], [0, 1]]), K[[0, 1], [0, 1]], max(size))
     focal = np.clip(focal, 0.1 * max(size), 100 * max(size))

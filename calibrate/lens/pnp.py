@@ -53,10 +53,11 @@ def with_poses(views: ViewSet, candidates: list[list[Candidate]], board: BoardSp
         )
     solved = []
     for view, options, k in zip(views, candidates, chosen, strict=True):
-        points = view.board_points
+        corners = view.corners
         if board is not None and options[k].turn:
-            points = transform_points(inverse(board_from_turned(board, options[k].turn)), points)
-        solved.append(replace(view, camera_from_board=options[k].camera_from_board, board_points=points))
+            turned = inverse(board_from_turned(board, options[k].turn))
+            corners = replace(corners, points=transform_points(turned, corners.points))
+        solved.append(replace(view, camera_from_board=options[k].camera_from_board, corners=corners))
     return replace(views, views=tuple(solved))
 
 
@@ -103,8 +104,8 @@ def _credible_px(best_px: Array) -> Array:
 def planar_tilts(view: BoardView, camera: CameraModel) -> Array:
     """Find poses (1 or 2, 4, 4) by which a flat board explains the image, the likelier first (IPPE)."""
     K = camera_matrix(camera)
-    points = np.ascontiguousarray(view.board_points)
-    pixels = np.ascontiguousarray(undistort(camera, view.pixels))
+    points = np.ascontiguousarray(view.corners.points)
+    pixels = np.ascontiguousarray(undistort(camera, view.corners.pixels))
     try:
         count, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, K, None, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error as problem:
@@ -118,7 +119,7 @@ def planar_tilts(view: BoardView, camera: CameraModel) -> Array:
 
 def view_rms_px(view: BoardView, camera: CameraModel, camera_from_board: Array) -> float:
     """Compute the rms distance of the corners from where the pose shows them, px."""
-    miss = project_at(camera, camera_from_board, view.board_points) - view.pixels
+    miss = project_at(camera, camera_from_board, view.corners.points) - view.corners.pixels
     return float(np.sqrt(np.square(miss).sum(axis=1).mean()))
 
 

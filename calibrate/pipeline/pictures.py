@@ -6,12 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibrate.boards.detect import detect
+from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_of, board_points, has_markers
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.handeye.blas_threads import one_blas_thread
@@ -22,9 +21,10 @@ from calibrate.handeye.solve import solve_views
 from calibrate.pipeline.gates import judge
 from calibrate.pipeline.job import single_threaded_opencv, with_board_poses
 from calibrate.pipeline.solved import Solved
-from calibrate.views.view_set import BoardView, ViewSet, array_of, require_size
+from calibrate.views.arrays import array_of
+from calibrate.views.corners import Corners
+from calibrate.views.view_set import BoardView, ViewSet, require_size
 from recordings.files import usable_cores
-from recordings.geometry import Array
 from recordings.importers import conventions
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 
@@ -37,30 +37,26 @@ class SolvedPictures(Solved):
     """Number of a picture without the board → reason."""
 
 
-class _Seen(NamedTuple):
-    points: Array
-    """(k, 3) on the board"""
-    pixels: Array
-    """(k, 2)"""
-    reason: str = ""
-    """Why there are none."""
-    size: tuple[int, int] | None = None
-    """Width and height; None of corners."""
-
-
-def _seen(given: ArrayLike | None, board: BoardSpec) -> _Seen:
-    points = board_points(board)
+def _look(given: ArrayLike | None, board: BoardSpec) -> Detection | Corners | None:
+    """Find the board in a picture; corners that are given stand as they are. None: no picture is given."""
     if given is None:
-        return _Seen(points[:0], np.zeros((0, 2)), "no picture given")
+        return None
     image = np.asanyarray(given)  # a masked array stays one
     if image.ndim == 2 and image.shape[1] == 2:
-        return _Seen(points, array_of(image, (len(points), 2), "corners"))
+        points = board_points(board)
+        return Corners(points, array_of(image, (len(points), 2), "corners"))
     plain = image.ndim in (2, 3) and image.size and image.shape[2:] in ((), (3,), (4,))
     if image.dtype not in (np.uint8, np.uint16) or not plain:
         shape = f"{image.shape} of {image.dtype}"
         raise BadViewsError("shape", what="a picture", given=shape, wanted="(h, w) or (h, w, 3) of uint8")
-    found = detect(image, board)
-    return _Seen(points[found.indices], found.pixels, found.reason, (found.width, found.height))
+    return detect(image, board)
+
+
+def _missing(seen: Detection | Corners | None) -> str:
+    """Say why a picture shows no board; empty: it does."""
+    if seen is None:
+        return "no picture given"
+    return seen.reason if isinstance(seen, Detection) else ""
 
 
 @single_threaded_opencv()
@@ -97,26 +93,29 @@ def solve(
     flanges = array_of(poses, (len(images), 4, 4), "poses")
     joints = None if joints_rad is None else array_of(joints_rad, (len(images), -1), "joints_rad")
     with ThreadPoolExecutor(usable_cores()) as pool:
-        seen = list(pool.map(lambda image: _seen(image, board), images))
+        seen = list(pool.map(lambda image: _look(image, board), images))
+    without = {i: reason for i, one in enumerate(seen) if (reason := _missing(one))}
     views = tuple(
         BoardView(
-            i, f"picture {i}", flanges[i], one.points, one.pixels, None if joints is None else joints[i]
+            i,
+            f"picture {i}",
+            flanges[i],
+            one.corners if isinstance(one, Detection) else one,
+            None if joints is None else joints[i],
         )
         for i, one in enumerate(seen)
-        if not one.reason
+        if one is not None and i not in without
     )
-    without = {i: one.reason for i, one in enumerate(seen) if one.reason}
     if len(views) < FEWEST_TO_SOLVE:
         counted = f"the board is seen in {len(views)} of {len(seen)} pictures"
         advice = f"{Counter(without.values()).most_common(1)[0][0]}" if without else "Take 15 to 25."
         raise TooFewViewsError(counted=counted, views=len(views), needed=FEWEST_TO_SOLVE, advice=advice)
-    sizes = [one.size for one in seen if one.size]
+    sizes = {i: (one.width, one.height) for i, one in enumerate(seen) if isinstance(one, Detection)}
     if camera is None and not sizes:
         raise BadViewsError("shape", what="camera", given="None", wanted="a CameraModel of the images' size")
-    camera = camera or CameraModel(*sizes[0])
-    for i, one in enumerate(seen):
-        if one.size is not None:
-            require_size(camera, one.size, i, f"picture {i}")
+    camera = camera or CameraModel(*next(iter(sizes.values())))
+    for i, size in sizes.items():
+        require_size(camera, size, i, f"picture {i}")
     found, intrinsics = with_board_poses(ViewSet(mount, views, camera, robot_model), board)
     options = options or SolveOptions()
     options = replace(

@@ -12,15 +12,15 @@ import numpy as np
 
 from calibrate.arms.kinematics import MODELS, URDF_LINKS, URDF_ORIGIN, RobotModel, table_of_axes
 from calibrate.boards.detect import Detection, detect
-from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.results import RejectedView
-from calibrate.views.view_set import NO_CORNERS, NOMINAL_CAMERA, BoardView, ViewSet, require_size
+from calibrate.views.corners import NO_CORNERS, Corners
+from calibrate.views.view_set import NOMINAL_CAMERA, BoardView, ViewSet, require_size
 from recordings import strict_yaml
 from recordings.errors import BadImageError
-from recordings.files import usable_cores
-from recordings.geometry import Array, pose, rotation_from_rpy
+from recordings.files import MAIN_CAMERA, usable_cores
+from recordings.geometry import pose, rotation_from_rpy
 from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.schema.messages import (
@@ -97,8 +97,7 @@ def load_views(
         if not detection.found:
             missing.append(RejectedView(view.index, view.name, detection.reason, "corners"))
             continue
-        points = board_points(spec)[detection.indices]
-        views.append(_board_view(view, points, detection.pixels))
+        views.append(_board_view(view, detection.corners))
     if len(views) < fewest:
         raise _too_few(recording, spec, len(views), seen, [*missing, *by_hand], fewest)
     if not (model.width and model.height):
@@ -121,15 +120,15 @@ def _told_views(
             needed=fewest,
             advice="Give more pairs of poses.",
         )
-    own = tuple(_board_view(view, *NO_CORNERS) for view in told)
+    own = tuple(_board_view(view, NO_CORNERS) for view in told)
     found = ViewSet(info.mount, own, NOMINAL_CAMERA, info.robot.model, _calibrated_arm(recording))
     return LoadedViews(found, info.board, tuple(by_hand), losses=recording.losses)
 
 
-def _board_view(view: View, points: Array, pixels: Array) -> BoardView:
+def _board_view(view: View, corners: Corners) -> BoardView:
     recorded = view.joints_rad, view.camera_from_board
     joints, board = (None if numbers is None else np.array(numbers) for numbers in recorded)
-    return BoardView(view.index, view.name, np.array(view.base_from_flange), points, pixels, joints, board)
+    return BoardView(view.index, view.name, np.array(view.base_from_flange), corners, joints, board)
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:
@@ -206,7 +205,8 @@ def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera
     height, width = picture.pixels.shape[:2]
     if camera.width:
         require_size(camera, (width, height), view.index, view.name)
-    return detect(viewable(picture.pixels, picture.pixel_format), spec)
+    name = recording.info.camera_identity.name or MAIN_CAMERA
+    return detect(viewable(picture.pixels, picture.pixel_format), spec, camera=name)
 
 
 def _too_few(

@@ -69,7 +69,7 @@ class Solved:
         points = bent_points(observed, shape)
         seen = board_in_camera(cell.mount, observed.flange, self.X, cell.board_place.matrix)
         return {
-            view.index: view.pixels - project_at(cell.camera, seen[i], points[i, : len(view.pixels)])
+            view.index: view.corners.pixels - project_at(cell.camera, seen[i], points[i, : len(view.corners)])
             for i, view in enumerate(self._as_read)
         }
 
@@ -84,7 +84,7 @@ class Solved:
 
         Needs matplotlib (the extra `report`). Raises BadViewsError for pairs of poses without corners.
         """
-        if not any(len(view.pixels) for view in self.views):
+        if not any(len(view.corners) for view in self.views):
             raise BadViewsError("no-corners")
         from matplotlib.figure import Figure
 
@@ -95,7 +95,7 @@ class Solved:
                 return file.getvalue()
 
         used, figure = set(self.solution.evidence.views.used), Shown(layout="constrained")
-        pixels = np.concatenate([view.pixels for view in self._as_read])
+        pixels = np.concatenate([view.corners.pixels for view in self._as_read])
         missed = np.concatenate(list(self.residuals_px.values()))
         good = np.concatenate([[index in used] * len(miss) for index, miss in self.residuals_px.items()])
         rms = float(np.sqrt(np.square(missed[good]).sum(axis=1).mean()))

@@ -95,9 +95,10 @@ def placed_corners(calibration: Calibration, base_from_flange: ArrayLike, seen: 
     B = calibration.board_place.transform.matrix
     placed = board_in_camera(calibration.mount, np.asarray(base_from_flange, float), X, B)
     turns = [placed @ board_from_turned(board, quarters) for quarters in (0, *looks_same_turns(board))]
-    points = board_points(board)[seen.indices]
+    points = board_points(board)[seen.corners.ids]
     at = [project_at(calibration.intrinsics.model, T, points) for T in turns]
-    return min(at, key=lambda pixels: float(np.nan_to_num(np.square(pixels - seen.pixels), nan=np.inf).sum()))
+    there = seen.corners.pixels
+    return min(at, key=lambda pixels: float(np.nan_to_num(np.square(pixels - there), nan=np.inf).sum()))
 
 
 def _marks(
@@ -106,11 +107,12 @@ def _marks(
     """Draw corners, and from each a magnified line towards where it is predicted; return the rms, too."""
     if seen is None or not seen.found:
         return [], None
-    off = placed_corners(calibration, base_from_flange, seen) - seen.pixels
-    corners = Marks(seen.pixels, REJECTED if bad else USED, thickness_px=5.0)
+    pixels = seen.corners.pixels
+    off = placed_corners(calibration, base_from_flange, seen) - pixels
+    corners = Marks(pixels, REJECTED if bad else USED, thickness_px=5.0)
     if not np.isfinite(off).all():
         return [corners], None
-    towards = Marks(seen.pixels, PREDICTED, seen.pixels + MAGNIFIED * off, thickness_px=3.0)
+    towards = Marks(pixels, PREDICTED, pixels + MAGNIFIED * off, thickness_px=3.0)
     return [corners, towards], float(np.sqrt((off**2).sum(axis=1).mean()))
 
 

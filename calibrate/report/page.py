@@ -136,7 +136,7 @@ def _placed(job: SolvedRecording, view: View) -> tuple[Array, Array, float]:
     def shown_at(points: Array) -> Array:
         return np.nan_to_num(project_at(calibration.intrinsics.model, C, points))
 
-    off = np.nan_to_num(placed_corners(calibration, view.base_from_flange, seen)) - seen.pixels
+    off = np.nan_to_num(placed_corners(calibration, view.base_from_flange, seen)) - seen.corners.pixels
     return shown_at(outline), shown_at(board), float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
 
@@ -149,8 +149,8 @@ def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, flo
     image, seen = job.recording.image(view), job.loaded.detections[view.index]
     pixels = to_grey(viewable(image.pixels, image.pixel_format))
     size = np.array(pixels.shape[::-1])
-    span = size * min(1.0, 2.4 * float(np.ptp(seen.pixels, axis=0).max()) / size.max())
-    corner = np.clip(np.median(seen.pixels, axis=0) - span / 2, 0, size - span).astype(int)
+    span = size * min(1.0, 2.4 * float(np.ptp(seen.corners.pixels, axis=0).max()) / size.max())
+    corner = np.clip(np.median(seen.corners.pixels, axis=0) - span / 2, 0, size - span).astype(int)
     (left, top), (right, bottom) = corner, np.ceil(corner + span).astype(int)
     scale = width_px / (right - left)
     small = cv2.resize(pixels[top:bottom, left:right], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

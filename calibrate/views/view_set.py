@@ -11,26 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibrate.arms.kinematics import RobotModel
 from calibrate.errors import BadViewsError, require_choice
+from calibrate.views.arrays import array_of
+from calibrate.views.corners import NO_CORNERS, Corners
 from recordings.geometry import Array, inverse
 from recordings.schema.messages import CameraModel, Mount
 
 NOMINAL_CAMERA = CameraModel(640, 480, ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0)))
 """Stands in where no picture shows the board: its poses were told."""
-NO_CORNERS = np.zeros((0, 3)), np.zeros((0, 2))
-
-
-def array_of(values: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
-    """Copy numbers of this shape, -1: any length; masked: NaN. BadViewsError (`shape`) says what is wrong."""
-    try:
-        found: Array = np.ma.filled(np.ma.array(values, dtype=float, copy=True), np.nan)
-    except (TypeError, ValueError):
-        found = np.zeros(())
-    if not found.size:
-        found = found.reshape([max(size, 0) for size in shape]) if -1 in shape else found
-    if found.ndim != len(shape) or any(a not in (-1, b) for a, b in zip(shape, found.shape, strict=True)):
-        given, wanted = (str(s).replace("-1", "n") for s in (found.shape, shape))
-        raise BadViewsError("shape", what=what, given=given, wanted=wanted)
-    return found
 
 
 def require_mount(mount: object) -> None:
@@ -55,24 +42,24 @@ class BoardView:
     name: str
     base_from_flange: Array
     """(4, 4)"""
-    board_points: Array
-    """(k, 3) detected corners in `board`, metres (z = 0)."""
-    pixels: Array
-    """(k, 2) the same corners in the image."""
+    corners: Corners
+    """What the detector measured, in pixels of the camera's whole image; `NO_CORNERS` of a board pose that
+    was told."""
     joints_rad: Array | None = None
     """(k,) of `JOINTS`, or None where no joints were recorded."""
     camera_from_board: Array | None = None
     """(4, 4) PnP, once intrinsics are known."""
 
     def __post_init__(self) -> None:
+        itself = f"view {self.index + 1} ({self.name})"
         for name, shape in _SHAPES.items():
             if (given := getattr(self, name)) is not None:
-                taken = array_of(given, shape, f"{name} of view {self.index + 1} ({self.name})")
-                object.__setattr__(self, name, taken)
+                object.__setattr__(self, name, array_of(given, shape, f"{name} of {itself}"))
+        object.__setattr__(self, "corners", self.corners.checked(itself))
         if self.joints_rad is not None and len(self.joints_rad) not in JOINTS:
             raise BadViewsError(
                 "shape",
-                what=f"joints_rad of view {self.index + 1} ({self.name})",
+                what=f"joints_rad of {itself}",
                 given=f"({len(self.joints_rad)},)",
                 wanted=f"({JOINTS[0]},) to ({JOINTS[-1]},)",
             )
@@ -82,8 +69,6 @@ JOINTS = range(5, 8)
 """How many joints an arm may have."""
 _SHAPES = {
     "base_from_flange": (4, 4),
-    "board_points": (-1, 3),
-    "pixels": (-1, 2),
     "joints_rad": (-1,),
     "camera_from_board": (4, 4),
 }
@@ -110,7 +95,7 @@ class ViewSet:
         flange = array_of(base_from_flange, (-1, 4, 4), "base_from_flange")
         boards = array_of(camera_from_board, flange.shape, "camera_from_board")
         views = (
-            BoardView(i, f"view {i}", F, *NO_CORNERS, camera_from_board=C)
+            BoardView(i, f"view {i}", F, NO_CORNERS, camera_from_board=C)
             for i, (F, C) in enumerate(zip(flange, boards, strict=True))
         )
         return cls(mount, tuple(views), NOMINAL_CAMERA)
@@ -142,7 +127,7 @@ def require_no_copies(views: ViewSet) -> None:
     """Raise BadViewsError for a view that is in the set twice: it tells nothing, and halves the variance."""
     first: dict[bytes, BoardView] = {}
     for view in views:
-        seen = view.pixels if len(view.pixels) else np.asarray(view.camera_from_board)
+        seen = view.corners.pixels if len(view.corners) else np.asarray(view.camera_from_board)
         key = view.base_from_flange.tobytes() + seen.tobytes()
         if key in first:
             other = first[key]
@@ -161,7 +146,7 @@ Places = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Padded arrays of all views, one row a view."""
+    """All views as the solver works on them, one row a view: made of their `Corners`, padded alike."""
 
     mount: Mount
     flange: Array
@@ -198,12 +183,14 @@ class Observations:
 
 def observe_views(views: ViewSet) -> Observations:
     """Pad the views' corners to one array, without errors of the arm."""
-    count = max(1, max(len(view.pixels) for view in views))
+    count = max(1, max(len(view.corners) for view in views))
     n = len(views)
     points, pixels, present = np.zeros((n, count, 3)), np.zeros((n, count, 2)), np.zeros((n, count))
     for i, view in enumerate(views):
-        k = len(view.pixels)
-        points[i, :k], pixels[i, :k], present[i, :k] = view.board_points, view.pixels, 1.0
+        k = len(view.corners)
+        points[i, :k] = view.corners.points
+        pixels[i, :k] = view.corners.pixels
+        present[i, :k] = 1.0
     extent = extent_of(points[present > 0]) if present.any() else np.array([[0.0, 0.0], [1.0, 1.0]])
     by_none = np.zeros((n, 6, 0))
     return Observations(views.mount, views.base_from_flange, points, pixels, present, by_none, extent)

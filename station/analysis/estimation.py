@@ -23,11 +23,11 @@ from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.errors import RecordingError
+from recordings.files import MAIN_CAMERA
 from recordings.geometry import Array
 from recordings.images import viewable
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
-from station.analysis.worker import CapturedView
 from station.cell.config import StationConfig, matrix4
 from station.cell.status import EstimateStatus
 from station.plan.visibility import count_in_parts
@@ -41,13 +41,15 @@ FOCAL_SIGMA = 0.02
 
 
 def running_estimate(
-    config: StationConfig, camera: CameraModel, lens_is_known: bool, seen: Sequence[CapturedView]
+    config: StationConfig, camera: CameraModel, lens_is_known: bool, seen: Sequence[BoardView]
 ) -> EstimateStatus:
     """Estimate from the views so far; with too few views or too little motion without numbers.
 
     `camera`: without a matrix nothing is known of its lens.
     """
-    shown = [count_in_parts(camera, view.pixels, COVERAGE_ROWS, COVERAGE_COLUMNS) > 0 for view in seen]
+    shown = [
+        count_in_parts(camera, view.corners.pixels, COVERAGE_ROWS, COVERAGE_COLUMNS) > 0 for view in seen
+    ]
     blank = EstimateStatus(
         len(seen),
         image_views=tuple(tuple(int(n) for n in row) for row in np.sum(shown, axis=0)),
@@ -102,7 +104,7 @@ class QuickFit:
 
 
 def solve_quickly(
-    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[CapturedView]
+    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[BoardView]
 ) -> QuickFit:
     """Fit the views quickly. CalibrationError, cv2.error or LinAlgError when they are degenerate."""
     views = as_views(mount, camera, board, seen)
@@ -116,10 +118,13 @@ def solve_quickly(
     return QuickFit(views, poses, fit_poses(poses))
 
 
-def as_views(mount: Mount, camera: CameraModel, board: BoardSpec, seen: Sequence[CapturedView]) -> ViewSet:
-    """Make the solver's views from captured ones."""
+def as_views(mount: Mount, camera: CameraModel, board: BoardSpec, seen: Sequence[BoardView]) -> ViewSet:
+    """Make the solver's views from captured ones.
+
+    The sizes of a new cell's board may have been corrected since: the corners are placed on `board` as it is.
+    """
     points = board_points(board)
-    found = (BoardView(v.index, f"p{v.index}", v.base_from_flange, points[v.indices], v.pixels) for v in seen)
+    found = (replace(view, corners=view.corners.placed(points)) for view in seen)
     return ViewSet(mount, tuple(found), camera)
 
 
@@ -136,17 +141,18 @@ def quick_covariance(quick: QuickFit, board: BoardSpec, free_lens: bool) -> Arra
     return covariance
 
 
-def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:
+def seen_before(path: Path, board: BoardSpec) -> list[BoardView]:
     """Detect the board in a recording; return the views that show it, skipping undecodable images.
 
     RecordingError for a recording that cannot be read.
     """
-    recording, seen = open_recording(path), []
+    recording, seen = open_recording(path), list[BoardView]()
+    camera = recording.info.camera_identity.name or MAIN_CAMERA
     for view in recording.views():
         with contextlib.suppress(RecordingError):
             image = recording.image(view)
-            found = detect(viewable(image.pixels, image.pixel_format), board)
+            found = detect(viewable(image.pixels, image.pixel_format), board, camera=camera)
             if found.found:
                 flange = np.array(view.base_from_flange)
-                seen.append(CapturedView(view.index, flange, found.indices, found.pixels))
+                seen.append(BoardView(view.index, view.name, flange, found.corners))
     return seen

@@ -15,7 +15,7 @@ import numpy as np
 from calibrate.errors import CalibrationError
 from calibrate.handeye.pose_fit import FREE, fit_poses, pose_views
 from calibrate.handeye.solution import Reading
-from calibrate.views.view_set import ViewSet, implied_flange
+from calibrate.views.view_set import BoardView, ViewSet, implied_flange
 from recordings.geometry import difference
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import (
@@ -25,7 +25,6 @@ from station.analysis.estimation import (
     quick_covariance,
     solve_quickly,
 )
-from station.analysis.worker import CapturedView
 from station.cell.errors import StationError
 from station.cell.layout import board_place
 
@@ -71,7 +70,7 @@ class FoundCell(QuickFit):
 
 
 def find_cell(
-    mount: Mount, board: BoardSpec, camera: CameraModel, lens_known: bool, seen: Sequence[CapturedView]
+    mount: Mount, board: BoardSpec, camera: CameraModel, lens_known: bool, seen: Sequence[BoardView]
 ) -> FoundCell | None:
     """Estimate camera and board pose, and the lens where it is not known, in about 0.1 s.
 
@@ -134,7 +133,7 @@ _WAYS = {
 
 
 def odd_view(
-    mount: Mount, board: BoardSpec, camera: CameraModel, lens_known: bool, seen: Sequence[CapturedView]
+    mount: Mount, board: BoardSpec, camera: CameraModel, lens_known: bool, seen: Sequence[BoardView]
 ) -> StationError | None:
     """Make the error for what cannot be about the newest view or all of them; None: they agree.
 

@@ -22,13 +22,13 @@ from calibrate.handeye.information import (
 )
 from calibrate.handeye.metrics import median_distance_m
 from calibrate.lens.pnp import candidate_poses, solve_pnp
+from calibrate.views.corners import Corners
 from calibrate.views.projection import project
-from calibrate.views.view_set import ViewSet, implied_flange
+from calibrate.views.view_set import BoardView, ViewSet, implied_flange
 from recordings.geometry import Array, pose, rotation_angle, rotation_exp, rotation_log, transform_points
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import as_views
 from station.analysis.found_cell import FoundCell, find_cell
-from station.analysis.worker import BoardDetection, CapturedView
 from station.plan.choose import camera_objective
 from station.plan.visibility import ViewRange, camera_views, distances_that_fill, outline, roll_of, visible
 
@@ -89,9 +89,9 @@ class Way:
     """The view differs from all so far."""
 
 
-def motion_px(before: BoardDetection, now: BoardDetection) -> float | None:
+def motion_px(before: Corners, now: Corners) -> float | None:
     """Measure how far the board moved between two images, by corners seen in both; None: there are none."""
-    _, first, second = np.intersect1d(before.indices, now.indices, return_indices=True)
+    _, first, second = np.intersect1d(before.ids, now.ids, return_indices=True)
     if not len(first):
         return None
     return float(np.median(np.linalg.norm(now.pixels[second] - before.pixels[first], axis=1)))
@@ -107,7 +107,7 @@ def next_view(
     board: BoardSpec,
     camera: CameraModel,
     lens_known: bool,
-    seen: Sequence[CapturedView],
+    seen: Sequence[BoardView],
     given_up: Sequence[Array] = (),
 ) -> NextView:
     """Choose the most useful next view, in some 0.3 s. `camera`: without a matrix its lens is unknown.
@@ -136,7 +136,7 @@ def next_view(
     return NextView(mount, board, lens, at, pool[best], found, after_m)
 
 
-def way_to(wanted: NextView, seen: CapturedView) -> Way:
+def way_to(wanted: NextView, seen: BoardView) -> Way:
     """Compare the board as it is seen now with the wanted view."""
     lens, board = wanted.camera, wanted.board
     (view,) = as_views(wanted.mount, lens, board, [seen])

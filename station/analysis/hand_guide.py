@@ -12,11 +12,12 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from calibrate.views.view_set import BoardView
 from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount
 from station.analysis.estimation import FEWEST_FOR_LENS
 from station.analysis.guidance import NextView, Way, motion_px, next_view, way_to
-from station.analysis.worker import BoardDetection, CapturedView
+from station.analysis.worker import Sighting
 from station.cell.errors import RobotError
 from station.cell.status import GuidanceStatus
 from station.cell.stillness import StillnessMonitor
@@ -57,7 +58,7 @@ class HandGuide:
         self._known: tuple[object, ...] | None = None
         """The cell and the numbers of the views by which it was chosen."""
         self._given_up = list[Array]()
-        self._seen: BoardDetection | None = None
+        self._seen: Sighting | None = None
         self._motion_px: float | None = None
         """Motion of the board between the last two images; None: it was not seen in both."""
         self._moved_s = self._again_s = 0.0
@@ -73,9 +74,9 @@ class HandGuide:
     async def look(
         self,
         cell: tuple[Mount, BoardSpec, CameraModel, bool],
-        views: Sequence[CapturedView],
+        views: Sequence[BoardView],
         image: Image,
-        seen: BoardDetection,
+        seen: Sighting,
     ) -> GuidanceStatus:
         """Compare the newest image with the wanted view, and set `way` and `take`.
 
@@ -86,14 +87,16 @@ class HandGuide:
             self._again_s = float("inf")
         self._count = len(views)
         wanted, way = await self._next(cell, views), Way("", False)
-        if seen.status.found:
+        if seen.detection.found:
             scale = wanted.camera.width / image.pixels.shape[1]  # previews may be smaller
-            view = CapturedView(-1, np.eye(4), seen.indices, (seen.pixels + 0.5) * scale - 0.5)
+            view = BoardView(-1, "now", np.eye(4), seen.detection.corners.scaled(scale))
             way = await self._call(way_to, wanted, view, timeout_s=_CHOOSE_S)
         self.way = way
         if seen is not self._seen:
             before, self._seen = self._seen, seen
-            self._motion_px = None if before is None else motion_px(before, seen)
+            self._motion_px = None
+            if before is not None:
+                self._motion_px = motion_px(before.detection.corners, seen.detection.corners)
         found, moves = self._stillness.measure(self._motion_px), ""
         try:
             self._latest()
@@ -103,9 +106,9 @@ class HandGuide:
         if (found is not None and moves) or self._motion_px is None:
             self._moved_s, self._again_s = time.monotonic(), 0.0
         tried = time.monotonic() < self._again_s
-        if not moves and self._motion_px is not None and seen.status.cause != "blurred" and not tried:
+        if not moves and self._motion_px is not None and seen.cause != "blurred" and not tried:
             self.take = way.new
-            if not way.new and seen.status.found and time.monotonic() - self._moved_s > GIVE_UP_S:
+            if not way.new and seen.detection.found and time.monotonic() - self._moved_s > GIVE_UP_S:
                 self._given_up.append(wanted.camera_from_board)
                 self._known, self._moved_s = None, time.monotonic()
         # With fewer the lens is rough, and its error would pass for one of board or mounting.
@@ -122,7 +125,7 @@ class HandGuide:
         )
 
     async def _next(
-        self, cell: tuple[Mount, BoardSpec, CameraModel, bool], views: Sequence[CapturedView]
+        self, cell: tuple[Mount, BoardSpec, CameraModel, bool], views: Sequence[BoardView]
     ) -> NextView:
         """Choose the wanted view anew when cell or views have changed."""
         known = (*cell, *(view.index for view in views))

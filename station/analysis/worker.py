@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.detect import detect
-from calibrate.boards.model import board_points
+from calibrate.boards.detect import Detection, detect
 from calibrate.errors import BadViewsError
 from calibrate.lens.pnp import planar_tilts
+from calibrate.views.corners import Corners
 from calibrate.views.view_set import BoardView
+from recordings.files import MAIN_CAMERA
 from recordings.geometry import Array, transform_points
 from recordings.images import Pixels, eight_bits, viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image
@@ -62,88 +63,12 @@ HIGHEST_GAIN_DB = 12.0
 _NICENESS = 5
 
 
-@dataclass(frozen=True, eq=False)
-class BoardDetection:
-    """Result of looking for the board in one image."""
-
-    status: DetectionStatus
-    indices: NDArray[np.intp]
-    """(k,) rows of `board_points`"""
-    pixels: Array
-    """(k, 2)"""
-
-
 def start_worker() -> None:
     """Set up the worker process: low priority and one thread, to leave a processor for the capture."""
     live_with_parent()
     with contextlib.suppress(OSError):  # a service may not be permitted to
         os.nice(_NICENESS)
     cv2.setNumThreads(1)
-
-
-def sight(
-    image: Pixels,
-    board: BoardSpec,
-    camera: CameraModel | None,
-    thorough: bool = True,
-    exposure: tuple[float, float] | None = None,
-) -> BoardDetection:
-    """Look for the board; distance and tilt are given where a lens, even a rough one, is known.
-
-    `exposure`: exposure (µs) and gain (dB) of the image; with it the result holds advice on both.
-    """
-    found = detect(image, board, thorough)
-    distance_m = tilt_rad = None
-    if found.found and camera is not None and camera.matrix is not None:
-        full = camera.width / image.shape[1]  # previews may be smaller than the camera's images
-        pixels = (found.pixels + 0.5) * full - 0.5
-        distance_m, tilt_rad = _distance_and_tilt(pixels, board_points(board)[found.indices], camera)
-    cause: str = found.cause
-    advice = ""
-    if exposure is not None:
-        light = assess(image, found.pixels if found.found else None, *exposure)
-        advice = light.text
-        if cause in ("", "not-found"):
-            cause = light.cause or cause
-    status = DetectionStatus(
-        found=found.found,
-        reason=found.reason,
-        corners=found.corners,
-        expected=found.expected,
-        saturated=round(float(found.saturated), 4),
-        coverage=round(float(found.coverage), 4),
-        tilt_rad=tilt_rad,
-        distance_m=distance_m,
-        cause=cause,
-        advice=advice,
-    )
-    return BoardDetection(status, found.indices, found.pixels)
-
-
-def _distance_and_tilt(
-    pixels: Array, points: Array, camera: CameraModel
-) -> tuple[float | None, float | None]:
-    """Compute distance (m) to the board's centre, and angle (rad) of its normal to the optical axis."""
-    try:
-        C = planar_tilts(BoardView(0, "", np.eye(4), points, pixels), camera)[0]
-    except BadViewsError:
-        return None, None
-    tilt = float(np.arccos(np.clip(abs(C[2, 2]), 0.0, 1.0)))
-    return round(float(np.linalg.norm(transform_points(C, points.mean(axis=0)))), 4), round(tilt, 4)
-
-
-@dataclass(frozen=True, eq=False)
-class CapturedView:
-    """A captured view that counts: flange pose and detected corners."""
-
-    index: int
-    """The pose number."""
-    base_from_flange: Array
-    """(4, 4)"""
-    indices: NDArray[np.intp]
-    """(k,) rows of `board_points`"""
-    pixels: Array
-    """(k, 2)"""
 
 
 @dataclass(frozen=True)
@@ -155,6 +80,78 @@ class ExposureAdvice:
     exposure_us: float
     gain_db: float
     """Advised exposure and gain; the present ones where these are good."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """The board as one image shows it, and the image's light."""
+
+    detection: Detection
+    tilt_rad: float | None = None
+    """Angle of the board's normal to the optical axis; None: no lens is known."""
+    distance_m: float | None = None
+    """To the middle of the corners seen."""
+    light: ExposureAdvice | None = None
+    """None: the image's exposure is not known."""
+
+    @property
+    def cause(self) -> str:
+        """Why no board was found, or what is wrong with the light; empty: all is well."""
+        cause = self.detection.cause
+        if self.light is not None and cause in ("", "not-found"):
+            return self.light.cause or cause
+        return cause
+
+
+def detection_status(sighting: Sighting) -> DetectionStatus:
+    """Make what a screen draws of it."""
+    found = sighting.detection
+    return DetectionStatus(
+        found=found.found,
+        reason=found.reason,
+        corners=len(found.corners),
+        expected=found.expected,
+        saturated=round(float(found.saturated), 4),
+        coverage=round(float(found.coverage), 4),
+        tilt_rad=sighting.tilt_rad,
+        distance_m=sighting.distance_m,
+        cause=sighting.cause,
+        advice="" if sighting.light is None else sighting.light.text,
+    )
+
+
+def sight(
+    image: Pixels,
+    board: BoardSpec,
+    camera: CameraModel | None,
+    thorough: bool = True,
+    exposure: tuple[float, float] | None = None,
+    camera_name: str = MAIN_CAMERA,
+) -> Sighting:
+    """Look for the board; distance and tilt are given where a lens, even a rough one, is known.
+
+    `exposure`: exposure (µs) and gain (dB) of the image; with it the result holds advice on both.
+    """
+    found = detect(image, board, thorough, camera=camera_name)
+    distance_m = tilt_rad = None
+    if found.found and camera is not None and camera.matrix is not None:
+        full = camera.width / image.shape[1]  # previews may be smaller than the camera's images
+        distance_m, tilt_rad = _distance_and_tilt(found.corners.scaled(full), camera)
+    light = None
+    if exposure is not None:
+        light = assess(image, found.corners.pixels if found.found else None, *exposure)
+    return Sighting(found, tilt_rad, distance_m, light)
+
+
+def _distance_and_tilt(corners: Corners, camera: CameraModel) -> tuple[float | None, float | None]:
+    """Compute distance (m) to the board's centre, and angle (rad) of its normal to the optical axis."""
+    try:
+        C = planar_tilts(BoardView(0, "", np.eye(4), corners), camera)[0]
+    except BadViewsError:
+        return None, None
+    tilt = float(np.arccos(np.clip(abs(C[2, 2]), 0.0, 1.0)))
+    centre = transform_points(C, corners.points.mean(axis=0))
+    return round(float(np.linalg.norm(centre)), 4), round(tilt, 4)
 
 
 def assess(image: Pixels, corners: Array | None, exposure_us: float, gain_db: float) -> ExposureAdvice:

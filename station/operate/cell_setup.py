@@ -10,14 +10,15 @@ import numpy as np
 
 from calibrate.boards.corners import to_grey
 from calibrate.boards.grids import seen_size
+from calibrate.views.view_set import BoardView
 from recordings.geometry import base_from_flange
 from recordings.images import viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity
 from station.analysis.hand_guide import HandGuide
-from station.analysis.worker import BoardDetection, CapturedView, sight
+from station.analysis.worker import Sighting, detection_status, sight
 from station.cell.config import CameraChoice, StillnessConfig
 from station.cell.errors import StationError
-from station.cell.status import GuidanceStatus
+from station.cell.status import DetectionStatus, GuidanceStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import Camera
 from station.devices.guided import RealHardware
@@ -42,13 +43,18 @@ class CellSetup:
         self.arm: GuidedArm | None = None
         self.camera: Camera | None = None
         self.cameras: tuple[CameraChoice, ...] = ()
-        self.seen: BoardDetection | None = None
+        self.seen: Sighting | None = None
         """The board in the newest image; None: it was not looked for."""
         self.counts: tuple[int, int] | None = None
         """Inner corners of a chessboard in the image, counted while no board is known."""
         self.guide: HandGuide | None = None
         self.guidance = GuidanceStatus()
         self._stillness = StillnessMonitor(StillnessConfig())
+
+    @property
+    def detection(self) -> DetectionStatus:
+        """What a screen draws of the board in the newest image."""
+        return DetectionStatus() if self.seen is None else detection_status(self.seen)
 
     @property
     def mount(self) -> Mount:
@@ -154,7 +160,7 @@ class CellSetup:
         if not guide.take or self.draft is not draft or self._stillness.moved_ns >= begun_ns:
             return False
         flange = np.array(base_from_flange(arm.state().tcp_pose, arm.identity.tcp_offset))
-        view = CapturedView(len(draft.views), flange, seen.indices, seen.pixels)
+        view = BoardView(len(draft.views), f"p{len(draft.views)}", flange, seen.detection.corners)
         self.change(views=(*draft.views, view))
         guide.taken(True)
         return True

@@ -6,14 +6,19 @@ import contextlib
 from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, TypedDict
 
 import msgspec
 import numpy as np
 
+from calibrate.boards.model import board_points
+from calibrate.errors import BadViewsError
+from calibrate.views.corners import Corners
+from calibrate.views.view_set import BoardView
 from recordings.files import ASKED_FOR, read_file, write_atomically
+from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotIdentity
 from station.analysis.found_cell import FoundCell, find_cell
-from station.analysis.worker import CapturedView
 from station.cell.config import CameraChoice
 
 FEWEST_GUIDED = 4
@@ -49,7 +54,7 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
     exposure_us: float = 10_000.0
     mount: Mount | None = None
     board: BoardSpec | None = None
-    views: tuple[CapturedView, ...] = ()
+    views: tuple[BoardView, ...] = ()
     table_m: float | None = None
     """Height of the table in `base`; None: derived from the board."""
 
@@ -77,12 +82,44 @@ _find = lru_cache(maxsize=2)(find_cell)
 
 def load_draft(root: Path) -> Draft:
     """Load what was found before; an empty one where there is nothing, or nothing readable."""
-    with contextlib.suppress(OSError, msgspec.DecodeError):
-        content = read_file(root / DRAFT_FILE, _LIMIT_BYTES)
-        return msgspec.json.decode(content, type=Draft, dec_hook=lambda kind, rows: np.array(rows))
+    with contextlib.suppress(OSError, msgspec.DecodeError, BadViewsError, IndexError):
+        tree = msgspec.json.decode(read_file(root / DRAFT_FILE, _LIMIT_BYTES), type=dict[str, Any])
+        kept = msgspec.convert(tree.pop("views", []), list[_KeptView])
+        draft = msgspec.convert(tree, Draft)
+        if draft.board is not None:
+            points = board_points(draft.board)
+            draft = msgspec.structs.replace(draft, views=tuple(_view(each, points) for each in kept))
+        return draft
     return Draft()
 
 
 def save_draft(root: Path, draft: Draft) -> None:
     root.mkdir(parents=True, exist_ok=True)
-    write_atomically(root / DRAFT_FILE, msgspec.json.encode(draft, enc_hook=np.ndarray.tolist), ASKED_FOR)
+    tree = msgspec.to_builtins(msgspec.structs.replace(draft, views=()))
+    if draft.views:
+        tree["views"] = [_kept(view) for view in draft.views]
+    write_atomically(root / DRAFT_FILE, msgspec.json.encode(tree), ASKED_FOR)
+
+
+class _KeptView(TypedDict):
+    """A view in the file: of its corners no points, which follow from the board."""
+
+    index: int
+    base_from_flange: list[list[float]]
+    indices: list[int]
+    pixels: list[list[float]]
+
+
+def _kept(view: BoardView) -> _KeptView:
+    return {
+        "index": view.index,
+        "base_from_flange": view.base_from_flange.tolist(),
+        "indices": view.corners.ids.tolist(),
+        "pixels": view.corners.pixels.tolist(),
+    }
+
+
+def _view(kept: _KeptView, points: Array) -> BoardView:
+    ids = np.array(kept["indices"], np.intp)
+    corners = Corners(points[ids], np.array(kept["pixels"]), ids)
+    return BoardView(kept["index"], f"p{kept['index']}", np.array(kept["base_from_flange"]), corners)

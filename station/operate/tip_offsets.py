@@ -19,6 +19,7 @@ from calibrate.files.folders import VERSION_NAME
 from calibrate.files.touch import Touch
 from calibrate.files.validity import time_text
 from calibrate.files.versions import note_in_file, note_installed, who
+from calibrate.views.corners import Corners
 from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, base_from_flange, inverse, transform_points
 from station.cell.config import Vector3
@@ -63,8 +64,10 @@ async def see_board(link: Client, status: StationStatus, file: Path) -> SeenBoar
         tip_m, pointer = link.config.pointer.tip_m, "the configured pointer"
     elif np.linalg.norm(tip_m) < _SHORTEST_M:
         raise RefusedError("no-pointer")
-    points = board_points(calibration.board)[list(seen.corners)]
-    view = BoardView(0, "touch test", np.array(seen.base_from_flange), points, np.array(seen.pixels))
+    ids = np.array(seen.corners)
+    points = board_points(calibration.board)[ids]
+    corners = Corners(points, np.array(seen.pixels), ids, camera=calibration.camera_name)
+    view = BoardView(0, "touch test", np.array(seen.base_from_flange), corners)
     now = await asyncio.to_thread(locate_board, calibration, view)
     return SeenBoard(calibration, now, tip_m, pointer)
 

@@ -11,11 +11,12 @@ from functools import partial
 
 import numpy as np
 
+from calibrate.views.view_set import BoardView
 from recordings.geometry import base_from_flange
 from recordings.images import Pixels, viewable
 from recordings.schema.messages import Image, RobotState, View
 from station.analysis.pool import WorkerError
-from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion, sight
+from station.analysis.worker import Sighting, board_box, detection_status, image_motion, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.status import StationState
@@ -125,44 +126,49 @@ async def _write(context: SessionContext, index: int, image: Image, view: View, 
     recording.require_open().image(image)
     sighting = await _sighting(context, image, index)
     unusable = _unusable(sighting, unchecked)
-    if sighting is not None and len(sighting.pixels):
-        recording.require_open().corners(image.sequence, sighting.pixels)
+    if sighting is not None and len(sighting.detection.corners):
+        recording.require_open().corners(image.sequence, sighting.detection.corners.pixels)
     if unusable is not None:
         await recording.sync()
         raise unusable
     recording.require_open().view(view)
     await recording.sync()
     if sighting is not None:
-        queue.note(index, corners=sighting.status.corners)
-        context.store.update(detection=sighting.status)
+        queue.note(index, corners=len(sighting.detection.corners))
+        context.store.update(detection=detection_status(sighting))
         flange = np.array(view.base_from_flange)
         context.seen.pop(index, None)  # the newest comes last
-        context.seen[index] = CapturedView(index, flange, sighting.indices, sighting.pixels)
+        context.seen[index] = BoardView(index, view.name, flange, sighting.detection.corners)
     queue.mark(index, "done")
     await recording.save_state(queue)
     context.show_poses(index)
-    corners = sighting.status.corners if sighting is not None else None
+    corners = len(sighting.detection.corners) if sighting is not None else None
     text = "saved" if corners is None else f"saved, {corners} corners"
     context.store.event("saved", text, "info", index, corners=corners)
 
 
-async def _sighting(context: SessionContext, image: Image, index: int) -> BoardDetection | None:
+async def _sighting(context: SessionContext, image: Image, index: int) -> Sighting | None:
     """Detect the board; None when the worker failed."""
     config, pixels = context.cell.config, viewable(image.pixels, image.pixel_format)
     try:
         return await context.workers.call(
-            sight, pixels, config.board, config.camera.model, timeout_s=DETECT_TIMEOUT_S
+            sight,
+            pixels,
+            config.board,
+            config.camera.model,
+            camera_name=config.camera.name,
+            timeout_s=DETECT_TIMEOUT_S,
         )
     except WorkerError as error:
         context.store.problem(error, "warning", index, "the image was not checked: {}")
         return None
 
 
-def _unusable(sighting: BoardDetection | None, unchecked: bool) -> PoseFailedError | None:
+def _unusable(sighting: Sighting | None, unchecked: bool) -> PoseFailedError | None:
     """Make the error where an image does not count; None when it does."""
     if sighting is None:
         return None if unchecked else PoseFailedError("not-checked")
-    status = sighting.status
+    status = detection_status(sighting)
     if not status.found:
         return PoseFailedError("no-board", reason=status.reason or "No board in the image.", advice="")
     if status.saturated > SATURATED_LIMIT:

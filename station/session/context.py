@@ -12,12 +12,12 @@ from pathlib import Path
 
 import msgspec
 
+from calibrate.views.view_set import BoardView
 from recordings.errors import CodedError, RecordingError, Value, plain_value
 from recordings.recorder import Recorder
 from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, RobotState, Stamps
 from station.analysis.pool import Workers
-from station.analysis.worker import CapturedView
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionState
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
@@ -61,7 +61,7 @@ class SessionContext:
     queue: PoseQueue | None = None
     recording: SessionRecording | None = None
     """Recording of the open session; None: no session is open."""
-    seen: dict[int, CapturedView] = field(default_factory=dict)
+    seen: dict[int, BoardView] = field(default_factory=dict)
     """Pose number → view that counts."""
     requests: RunRequests = field(default_factory=RunRequests)
 

@@ -6,11 +6,11 @@ import asyncio
 import contextlib
 import logging
 
+from calibrate.views.view_set import BoardView
 from recordings.errors import RecordingError
 from station.analysis.estimation import running_estimate, seen_before
 from station.analysis.found_cell import odd_view
 from station.analysis.pool import WorkerError
-from station.analysis.worker import CapturedView
 from station.cell.status import EstimateStatus
 from station.session.context import SessionContext
 from station.session.recording import stamps_now
@@ -27,7 +27,7 @@ class Estimator:
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
-        self._known: tuple[CapturedView, ...] = ()
+        self._known: tuple[BoardView, ...] = ()
         self._woken = asyncio.Event()
 
     def poke(self) -> None:

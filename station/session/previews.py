@@ -14,7 +14,7 @@ from recordings.geometry import base_from_flange
 from recordings.images import viewable
 from recordings.schema.messages import BoardSpec, Image
 from station.analysis.pool import WorkerError
-from station.analysis.worker import BoardDetection, preview_image, sight
+from station.analysis.worker import Sighting, detection_status, preview_image, sight
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import NO_IMAGE, NOT_LOOKED, DetectionStatus, StationState
@@ -44,7 +44,7 @@ class Looked(NamedTuple):
     image: Image
     taken_s: float
     """When the image came (host monotonic)."""
-    sighting: BoardDetection | None
+    sighting: Sighting | None
     """None: the worker hung or died."""
 
 
@@ -56,7 +56,7 @@ class Previewer:
         self._taking = asyncio.Lock()
         self._picture: Image | None = None
         """The newest image."""
-        self._sighting: BoardDetection | None = None
+        self._sighting: Sighting | None = None
         """The board in it; None: it was not looked for, or not in time."""
         self._taken_s = 0.0
         """When an image was last asked for (host monotonic); 0: never."""
@@ -68,7 +68,7 @@ class Previewer:
         """The search for the board in an image, which may take longer than the next image does."""
         self._count = 0
 
-    async def look(self) -> tuple[Image, BoardDetection] | None:
+    async def look(self) -> tuple[Image, Sighting] | None:
         """Return an image and the board in it, however long that takes; None without one."""
         await self._renew()
         if self._picture is not None and self._sighting is not None:
@@ -85,7 +85,7 @@ class Previewer:
             return PreviewImage()
         low, high = SIDES
         width, height = min(max(width, low), high), min(max(height, low), high)
-        corners = np.zeros((0, 2)) if self._sighting is None else self._sighting.pixels
+        corners = np.zeros((0, 2)) if self._sighting is None else self._sighting.detection.corners.pixels
         return await asyncio.to_thread(preview_image, self._picture, corners, width, height, self._count)
 
     async def _renew(self) -> None:
@@ -114,8 +114,8 @@ class Previewer:
             )
         return Observation(
             base_from_flange=matrix4(base_from_flange(state.tcp_pose, arm.identity.tcp_offset)),
-            corners=tuple(found.indices.tolist()),
-            pixels=tuple((float(u), float(v)) for u, v in found.pixels),
+            corners=tuple(found.corners.ids.tolist()),
+            pixels=tuple((float(u), float(v)) for u, v in found.corners.pixels),
         )
 
     async def _take(self) -> None:
@@ -139,7 +139,7 @@ class Previewer:
         self._sighting = await self._sighted(image)
         self._count += 1
 
-    async def _sighted(self, image: Image) -> BoardDetection | None:
+    async def _sighted(self, image: Image) -> Sighting | None:
         """Look for the board in the newest image, for `LOOK_S`, and tell the screens what is seen.
 
         None: it takes longer, or the search in an earlier image does. Then the image is shown without its
@@ -148,13 +148,13 @@ class Previewer:
         if self._looking is None:
             self._looking = asyncio.create_task(self._look_in_worker(image, self._seen_s))
             await asyncio.wait({self._looking}, timeout=LOOK_S)
-        sighting: BoardDetection | None = None
+        sighting: Sighting | None = None
         if self._looking.done():
             looked = self._looking.result()
             self._looking = None
             if looked.sighting is not None:
                 self._looked_s = looked.taken_s
-                self._tell(looked.sighting.status)
+                self._tell(detection_status(looked.sighting))
             sighting = looked.sighting if looked.image is image else None
         if self._seen_s - self._looked_s > OLD_S:
             reason = "not looked at for the board: the computer is busy"
@@ -180,6 +180,7 @@ class Previewer:
                 config.camera.model,
                 False,
                 exposure,
+                config.camera.name,
                 timeout_s=patience_s,
             )
         except WorkerError:

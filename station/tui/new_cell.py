@@ -24,7 +24,6 @@ from recordings.errors import CodedError
 from station.analysis.worker import preview_image
 from station.cell.config import CameraChoice
 from station.cell.errors import StationError
-from station.cell.status import DetectionStatus
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CellStep
@@ -157,14 +156,13 @@ class NewCell(LivePageApp[Ending]):
         pane = self.query_one(PreviewPane)
         if pane.display or self.live_page is not None:
             self._pictures += 1
-            corners = np.zeros((0, 2)) if setup.seen is None else setup.seen.pixels
+            corners = np.zeros((0, 2)) if setup.seen is None else setup.seen.detection.corners.pixels
             picture = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
             pane.wanted = setup.guidance.outline if self.step is CellStep.VIEWS else ()
             pane.show(picture)
             if self.live_page is not None:
-                seen = DetectionStatus() if setup.seen is None else setup.seen.status
                 action, views = next_of(setup, self.step, line.value.strip()), len(setup.draft.views)
-                self._news = news("New cell", action, seen, setup.guidance, views, picture)
+                self._news = news("New cell", action, setup.detection, setup.guidance, views, picture)
                 self.live_page.publish(self._news)
         if taken:
             self._view_taken()

@@ -13,7 +13,6 @@ from calibrate.boards.model import describe_board, typed_board
 from recordings.errors import CodedError
 from recordings.schema.messages import Mount
 from station.cell.errors import StationError
-from station.cell.status import DetectionStatus
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import FEWEST_GUIDED, CellStep
@@ -134,7 +133,7 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
         case CellStep.VIEWS:
             if draft.enough:
                 return Action("Enter", "On to the file", "The views are enough.")
-            return to_wanted(setup.guidance, DetectionStatus() if setup.seen is None else setup.seen.status)
+            return to_wanted(setup.guidance, setup.detection)
     if draft.posted:
         return Action("Enter", "Write it, open the cell", "Then start the program that posts.")
     return Action("Enter", "Write it, open the cell", "Or F9: write and rehearse.")
@@ -155,11 +154,10 @@ def _board_typed(setup: CellSetup, text: str) -> Action:
 def live_lines(setup: CellSetup, step: CellStep) -> Content:
     """Return the lines that follow arm and camera, shown ten times a second."""
     draft, found = setup.draft, setup.draft.found
-    board, seen = dim(""), setup.seen
+    board = dim("")
     if draft.board is not None:
-        board = (
-            dim(f"{describe_board(draft.board)}: looking …") if seen is None else quality_line(seen.status)
-        )
+        looking = dim(f"{describe_board(draft.board)}: looking …")
+        board = looking if setup.seen is None else quality_line(setup.detection)
     match step:
         case CellStep.BOARD:
             return board

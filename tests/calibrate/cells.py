@@ -84,11 +84,11 @@ def real_cell(
     cell = make_cell(rng, views, noise, mount=mount, with_pnp=False)
     pictures = []
     for view, C in zip(cell.views, cell.C, strict=True):
-        bent = printed(view.board_points, shape)
+        bent = printed(view.corners.points, shape)
         pixels = project(camera, bent @ C[:3, :3].T + C[:3, 3]).pixels
         pixels = pixels + rng.normal(size=pixels.shape) * noise.corner_px
-        pixels = pixels + smooth_bias(rng, view.board_points, bias_px)
-        pictures.append(replace(view, pixels=pixels))
+        pixels = pixels + smooth_bias(rng, view.corners.points, bias_px)
+        pictures.append(replace(view, corners=replace(view.corners, pixels=pixels)))
     seen = solve_pnp(replace(cell.views, views=tuple(pictures), camera=stated or camera))
     return replace(cell, views=seen, camera=camera)
 
@@ -125,10 +125,14 @@ def nudged(views: ViewSet, places: list[int], deltas: Array) -> ViewSet:
 
 
 def changed(views: ViewSet, places: list[int], **fields: Any) -> ViewSet:
-    """The views, at these places with fields replaced by functions of the old view."""
+    """The views, at these places with fields, or `points` or `pixels` of their corners, replaced by functions
+    of the old view."""
     out: list[BoardView] = list(views.views)
     for i in places:
-        out[i] = replace(out[i], **{name: make(out[i]) for name, make in fields.items()})
+        made = {name: make(out[i]) for name, make in fields.items()}
+        of_corners = {name: made.pop(name) for name in ("points", "pixels") if name in made}
+        corners = replace(made.pop("corners", out[i].corners), **of_corners)
+        out[i] = replace(out[i], corners=corners, **made)
     return replace(views, views=tuple(out))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibrate.lens.pnp import solve_pnp
+from calibrate.views.corners import Corners
 from calibrate.views.projection import project
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
@@ -150,7 +151,7 @@ def views_at(
             size=(len(POINTS), 2)
         )
         told = arm.forward(q[i : i + 1])[0]
-        seen.append(BoardView(i, f"view {i}", told, POINTS, pixels, q[i] if joints else None))
+        seen.append(BoardView(i, f"view {i}", told, Corners(POINTS, pixels), q[i] if joints else None))
     return ViewSet(mount, tuple(seen), CAMERA)
 
 

@@ -8,6 +8,7 @@ from calibrate.boards.model import board_points
 from calibrate.files.calibration import FORMAT, Calibration, Lens, Provenance, Quality, Sigma
 from calibrate.handeye.arm_table import FramePose
 from calibrate.results import Certificate, Views
+from calibrate.views.corners import Corners
 from calibrate.views.projection import project_at
 from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, Transform, inverse, perturb
@@ -78,4 +79,4 @@ def seen_from(
     pixels = project_at(truth.camera, inverse(base_from_camera) @ base_from_board, points)
     if rng is not None:
         pixels = pixels + rng.normal(0, CORNER_PX, pixels.shape)
-    return BoardView(0, "now", base_from_flange if told is None else told, points, pixels)
+    return BoardView(0, "now", base_from_flange if told is None else told, Corners(points, pixels))

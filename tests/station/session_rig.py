@@ -12,7 +12,9 @@ import msgspec
 import numpy as np
 
 from calibrate.arms.kinematics import MODELS, forward
+from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
+from calibrate.views.corners import Corners
 from recordings.geometry import rotation_log
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import (
@@ -24,11 +26,11 @@ from recordings.schema.messages import (
     RobotState,
     Stamps,
 )
-from station.analysis.worker import BoardDetection, sight
+from station.analysis.worker import Sighting, sight
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
-from station.cell.status import ArmCondition, CameraCounts, DetectionStatus, Event, FrameTiming, StationState
+from station.cell.status import ArmCondition, CameraCounts, Event, FrameTiming, StationState
 from station.devices.cell import Cell
 from station.devices.news import CURRENT_S, Evidence
 from station.devices.ur import control_trouble
@@ -242,8 +244,7 @@ class WorkerInThisProcess:
         self.waiting = 0
         points = board_points(TRUTH.board)
         pixels = 150 + 2500 * points[:, :2]
-        status = DetectionStatus(found=True, corners=len(points), expected=len(points))
-        self.sees = BoardDetection(status, np.arange(len(points)), pixels)
+        self.sees = Sighting(Detection("", "", Corners(points, pixels), len(points), 1280, 1024, 0.0, 0.0))
 
     async def start(self) -> None:
         return None

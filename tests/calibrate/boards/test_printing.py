@@ -47,16 +47,16 @@ def test_a_tag_that_is_seen_on_two_boards_is_read_on_neither(hidden: bool) -> No
     if hidden:
         sheet[:, : sheet.shape[1] // 4] = 255
     found = detect(np.concatenate([sheet, first_column], axis=1), spec)
-    assert sorted(found.indices.tolist()) == [i for i in range(48) if i // 4 % spec.columns]
+    assert sorted(found.corners.ids.tolist()) == [i for i in range(48) if i // 4 % spec.columns]
 
 
 @pytest.mark.parametrize("spec", BOARDS, ids=lambda s: f"{s.kind.value}-{s.columns}x{s.rows}")
 def test_every_printed_board_is_found_whole_and_to_scale(spec: BoardSpec) -> None:
     found = detect(printed(board_sheet(spec)), spec)
-    assert found.corners == len(board_points(spec)), found.reason
+    assert len(found.corners) == len(board_points(spec)), found.reason
     # Distances on the sheet are those of the board, to a tenth of a millimetre over the whole board.
-    plane = board_points(spec)[found.indices][:, :2] * 1000
-    H, _ = cv2.estimateAffine2D(plane, found.pixels / PX_MM)
+    plane = board_points(spec)[found.corners.ids][:, :2] * 1000
+    H, _ = cv2.estimateAffine2D(plane, found.corners.pixels / PX_MM)
     scale = np.linalg.svd(H[:, :2], compute_uv=False)
     span = np.ptp(plane, axis=0).max()
     assert np.abs(scale - 1).max() * span < 0.1
@@ -67,8 +67,8 @@ def test_every_printed_board_is_found_whole_and_to_scale(spec: BoardSpec) -> Non
 def test_a_texture_has_whole_pixels_a_square_and_a_white_border(spec: BoardSpec) -> None:
     texture = board_texture(spec, 60)
     found = detect(texture, spec)
-    offsets = found.pixels - board_points(spec)[found.indices][:, :2] * 60 / spec.square_m
-    assert found.corners == len(board_points(spec)) and np.ptp(offsets, axis=0).max() < 0.5
+    offsets = found.corners.pixels - board_points(spec)[found.corners.ids][:, :2] * 60 / spec.square_m
+    assert len(found.corners) == len(board_points(spec)) and np.ptp(offsets, axis=0).max() < 0.5
     border = np.ones_like(texture, bool)
     border[60:-60, 60:-60] = False
     assert (texture[border] == 255).all()

@@ -26,6 +26,7 @@ from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline.job import SolvedRecording
+from calibrate.views.corners import Corners
 from calibrate.views.projection import intrinsics_vector, project_at, with_intrinsics_vector
 from calibrate.views.view_set import BoardView, ViewSet, extent_of
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp
@@ -67,7 +68,7 @@ def few_views(
         flange = BOARD @ inverse(X @ seen) if mount == "eye-in-hand" else X @ seen @ inverse(BOARD)
         wrong = np.r_[rng.normal(size=3) * ROBOT_M, rng.normal(size=3) * ROBOT_RAD]
         pixels = project_at(camera, seen, points) + rng.normal(size=(42, 2)) * CORNER_PX
-        found.append(BoardView(k, str(k), perturb(flange, wrong), POINTS, pixels))
+        found.append(BoardView(k, str(k), perturb(flange, wrong), Corners(POINTS, pixels)))
     return solve_pnp(ViewSet(mount, tuple(found), known.mean.camera))
 
 
@@ -249,11 +250,13 @@ def test_too_few_or_untelling_views_are_refused() -> None:
     with raises("too-few-views", TooFewViewsError, views=2, needed=3):
         check_drift(views.select([0, 1]), installed())
     with raises("no-corners", BadViewsError):
-        bare = {"pixels": lambda view: view.pixels[:0], "board_points": lambda view: view.board_points[:0]}
+        bare = {"corners": lambda view: view.corners.part(slice(0))}
         check_drift(changed(views, [0, 1, 2], **bare), installed())
     with raises("shift-open", BadViewsError):
-        alike = (replace(views.views[0], pixels=views.views[0].pixels + 1e-9 * k) for k in range(3))
-        check_drift(replace(views, views=tuple(alike)), installed())
+        first = views.views[0]
+        shown = (replace(first.corners, pixels=first.corners.pixels + 1e-9 * k) for k in range(3))
+        alike = tuple(replace(first, corners=corners) for corners in shown)
+        check_drift(replace(views, views=alike), installed())
 
 
 KNOWN = installed()

@@ -45,7 +45,7 @@ def cell(request: pytest.FixtureRequest) -> ArmCell:
 def four_corners(views: ViewSet) -> ViewSet:
     """The same pictures of a tag: only the outermost corners of the board."""
     few = [0, 8, 54, 62]
-    small = (replace(v, board_points=v.board_points[few], pixels=v.pixels[few]) for v in views)
+    small = (replace(v, corners=v.corners.part(few)) for v in views)
     return replace(views, views=tuple(small))
 
 
@@ -59,7 +59,10 @@ def test_a_shift_is_noticed_within_ten_pictures_and_nothing_else(cell: ArmCell) 
     moved = four_corners(later_views(cell, np.r_[1.5e-3, np.zeros(5)], 2, 10))
     found = earlier.test(moved)
     assert not found.passed and found.shift_mm == pytest.approx(1.5, abs=0.4)
-    blurred = [replace(v, pixels=v.pixels + np.array([2.0, -1.0]) * (i == 1)) for i, v in enumerate(after)]
+    blurred = list(after)
+    corners = after.views[1].corners
+    off = corners.pixels + np.array([2.0, -1.0])
+    blurred[1] = replace(after.views[1], corners=replace(corners, pixels=off))
     assert earlier.test(replace(after, views=tuple(blurred[:3]))).passed  # one of three is no move
     stuck = replace(before, views=(*before.views, *(after.views[0],) * 3))
     with raises("view-twice", BadViewsError):

@@ -135,7 +135,7 @@ def test_a_public_solve_uses_one_thread(watcher: Watcher) -> None:
 def test_pictures_are_solved_with_one_thread_from_the_first_to_the_last(watcher: Watcher) -> None:
     views = make_cell(np.random.default_rng(1), views=12).views
     reading: list[set[int]] = []
-    corners = [Corners(view.pixels, reading) for view in views]
+    corners = [Corners(view.corners.pixels, reading) for view in views]
     calibrate.solve(
         corners,
         views.base_from_flange,

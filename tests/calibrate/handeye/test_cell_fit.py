@@ -49,7 +49,7 @@ def test_a_camera_that_moved_near_the_end_never_passes(at):
 
 
 def half_turn(view):
-    return pose(rotation_exp([0, 0, np.pi]), [*view.board_points[:, :2].max(axis=0), 0.0])
+    return pose(rotation_exp([0, 0, np.pi]), [*view.corners.points[:, :2].max(axis=0), 0.0])
 
 
 @MOUNTS
@@ -58,7 +58,7 @@ def test_half_turned_boards_are_set_right_and_used(mount):
     views = changed(
         cell.views,
         [2, 9, 15],
-        board_points=lambda v: transform_points(half_turn(v), v.board_points),
+        points=lambda v: transform_points(half_turn(v), v.corners.points),
         camera_from_board=lambda v: v.camera_from_board @ half_turn(v),
     )
     solution, straight = solve_views(views, QUICK), solve_views(cell.views, QUICK)

@@ -13,6 +13,7 @@ from calibrate import JobOptions
 from calibrate.errors import BadViewsError, UsageError
 from calibrate.handeye import (
     BoardView,
+    Corners,
     MeasurementNoise,
     SolveOptions,
     ViewSet,
@@ -24,7 +25,7 @@ from tests.codes import raises
 
 CELL = make_cell(np.random.default_rng(0), 8, LOW)
 F, C = CELL.views.base_from_flange, CELL.views.camera_from_board
-BOARD = CELL.views.views[0].board_points
+BOARD = CELL.views.views[0].corners.points
 
 
 def informed(mount="eye-in-hand", flange=F, X=CELL.X, points=BOARD):
@@ -38,8 +39,8 @@ def test_lists_are_taken_like_arrays():
     np.testing.assert_array_equal(solve_views(of_lists, quick).matrix, solve_views(of_arrays, quick).matrix)
     lists = informed("eye-in-hand", F.tolist(), CELL.X.tolist(), BOARD.tolist())
     np.testing.assert_array_equal(lists, informed())
-    view = BoardView(0, "a", F[0].tolist(), [], [], camera_from_board=C[0].tolist())
-    assert view.base_from_flange.shape == (4, 4) and view.pixels.shape == (0, 2)
+    view = BoardView(0, "a", F[0].tolist(), Corners([], []), camera_from_board=C[0].tolist())
+    assert view.base_from_flange.shape == (4, 4) and view.corners.pixels.shape == (0, 2)
 
 
 @pytest.mark.parametrize("mount", ["eye_in_hand", "eye-in-Hand", "", None])
@@ -73,8 +74,8 @@ def test_a_misspelt_choice_is_refused(made):
         lambda: ViewSet.from_poses("eye-in-hand", F, C[:-1]),
         lambda: ViewSet.from_poses("eye-in-hand", F, [*C[:-1].tolist(), [1.0]]),
         lambda: ViewSet.from_poses("eye-in-hand", F, None),
-        lambda: BoardView(0, "a", F[0], np.zeros((4, 2)), np.zeros((4, 2))),
-        lambda: BoardView(0, "a", F[0], np.zeros((4, 3)), np.zeros((4, 2)), np.zeros(8)),
+        lambda: BoardView(0, "a", F[0], Corners(np.zeros((4, 2)), np.zeros((4, 2)))),
+        lambda: BoardView(0, "a", F[0], Corners(np.zeros((4, 3)), np.zeros((4, 2))), np.zeros(8)),
         lambda: informed(flange=F[:, :3]),
         lambda: informed(X=CELL.X[:3]),
         lambda: informed(points=BOARD[:, :2]),

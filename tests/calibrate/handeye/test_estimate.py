@@ -131,7 +131,7 @@ def test_wrong_corners_hardly_move_it():
     views = cell.views
     for i, k, shift in ((2, 5, 30.0), (7, 0, -80.0), (9, 41, 3.0)):
         off = shift * (np.arange(42) == k)[:, None]
-        views = changed(views, [i], pixels=lambda v, off=off: v.pixels + off)
+        views = changed(views, [i], pixels=lambda v, off=off: v.corners.pixels + off)
     spoilt = solve_views(views, QUICK)
     assert spoilt.evidence.views.rejected == []
     delta = difference(spoilt.matrix, clean.matrix)
@@ -165,6 +165,6 @@ def test_every_seed_ends_in_the_same_camera():
 def test_four_corners_of_a_tag_are_noisy_though_little_tells_it(mount):
     """Pose and lens explain nearly all of them. That must not take most corners' weight."""
     views, tag = arm_cell("ur", mount, 0.0, 3, views=20).views, [0, 8, 54, 62]
-    few = {"pixels": lambda view: view.pixels[tag], "board_points": lambda view: view.board_points[tag]}
+    few = {"corners": lambda view: view.corners.part(tag)}
     fit = fit_cell(changed(views, list(range(20)), **few), Priors(LensPrior.unknown(views.camera)), 0).plain
     assert 0.05 < fit.scales.sigma_px <= fit.scales.tau_px < 0.5 and fit.corner_weights.min() > 0.1

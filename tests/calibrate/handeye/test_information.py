@@ -22,7 +22,7 @@ def test_the_predicted_sigma_is_the_one_that_the_solver_states(mount):
     noise = MeasurementNoise(0.5, 5e-5, 1e-4)  # robot and corners count alike
     cell = make_cell(np.random.default_rng(4), 25, noise, mount=mount)
     solution = solve_views(cell.views, replace(QUICK, intrinsics_from_same_pictures=True))
-    points = cell.views.views[0].board_points
+    points = cell.views.views[0].corners.points
     each = view_information(mount, cell.camera, cell.flange, cell.X, cell.Y, points, noise)
     prior = prior_information(cell.camera, False, BoardTolerance())
     predicted = np.diag(covariance_of(each.sum(axis=0), prior))

@@ -23,9 +23,7 @@ def setting(mount, with_arm_errors):
     rng = np.random.default_rng(3)
     camera = LENSES["plumb_bob"]
     cell = real_cell(rng, VIEWS, MID, mount=mount, camera=camera)
-    views = changed(
-        cell.views, [2], pixels=lambda v: v.pixels[:25], board_points=lambda v: v.board_points[:25]
-    )
+    views = changed(cell.views, [2], corners=lambda v: v.corners.part(slice(25)))
     observed = observe_views(views)
     state = CellState(
         perturb(cell.X, 1e-3 * rng.normal(size=6)),

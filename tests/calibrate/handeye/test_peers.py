@@ -10,6 +10,7 @@ from calibrate.handeye.axxb.peer_methods import linear_system, orthonormalised, 
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.peers import compare_all, reprojection_px
 from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.views.corners import NO_CORNERS
 from recordings.geometry import inverse, is_rigid, pose, rotation_exp
 from tests.calibrate.cells import LOW, MID, MOUNTS, error_mm_deg, make_cell
 
@@ -99,8 +100,7 @@ def test_a_method_that_fails_is_a_row_not_a_crash():
     from dataclasses import replace
 
     cell = make_cell(np.random.default_rng(5), 12, LOW)
-    empty = np.zeros((0, 3)), np.zeros((0, 2))
-    views = tuple(replace(view, board_points=empty[0], pixels=empty[1]) for view in cell.views)
+    views = tuple(replace(view, corners=NO_CORNERS) for view in cell.views)
     rows = {row.name: row for row in compare_all(replace(cell.views, views=views))}
     assert rows["reprojection only"].matrix is None
     assert rows["ours"].reprojection_px is None

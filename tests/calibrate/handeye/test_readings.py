@@ -54,12 +54,12 @@ def mirrored(c):
     width = c.camera.width
 
     def flipped(view):
-        return view.pixels * [-1, 1] + [width - 1, 0]
+        return view.corners.pixels * [-1, 1] + [width - 1, 0]
 
     def counted(view):
-        return view.board_points * [-1, 1, 1] + [view.board_points[:, 0].max(), 0, 0]
+        return view.corners.points * [-1, 1, 1] + [view.corners.points[:, 0].max(), 0, 0]
 
-    views = changed(c.views, list(range(len(c.views))), pixels=flipped, board_points=counted)
+    views = changed(c.views, list(range(len(c.views))), pixels=flipped, points=counted)
     return seen_through(views, c.camera)
 
 
@@ -72,14 +72,14 @@ def refocused(c):
 
     def pixels(view):
         C = c.C[view.index]
-        return project(lens, view.board_points @ C[:3, :3].T + C[:3, 3]).pixels
+        return project(lens, view.corners.points @ C[:3, :3].T + C[:3, 3]).pixels
 
     return seen_through(changed(c.views, list(range(HALF, len(c.views))), pixels=pixels), c.camera)
 
 
 def of_other_size(c):
     every = list(range(len(c.views)))
-    return seen_through(changed(c.views, every, board_points=lambda v: v.board_points / 1.08), c.camera)
+    return seen_through(changed(c.views, every, points=lambda v: v.corners.points / 1.08), c.camera)
 
 
 def in_millimetres(c):
@@ -213,7 +213,7 @@ def test_a_wrong_order_of_angles_is_named(order, meant, said):
 def test_a_board_given_in_millimetres_is_told_from_robot_poses_that_are():
     """One factor for the board: a thousand where the robot's numbers are too large, a thousandth here."""
     c = cell("eye-in-hand")
-    views = changed(c.views, list(range(len(c.views))), board_points=lambda v: v.board_points * 1e3)
+    views = changed(c.views, list(range(len(c.views))), points=lambda v: v.corners.points * 1e3)
     found = explained(seen_through(views, c.camera))
     assert found.reading is Reading.MILLIMETRES
     assert found.factor == pytest.approx(1e-3, rel=0.1)

@@ -17,9 +17,7 @@ SHAPE = (0.01, 0.02, 0.003, -0.002, 0.001)
 def observed_cell(seed, camera):
     """Three pictures, one with corners missing, of a board that is far from its drawing."""
     cell = real_cell(np.random.default_rng(seed), 3, camera=camera, shape=SHAPE)
-    views = changed(
-        cell.views, [1], pixels=lambda v: v.pixels[:30], board_points=lambda v: v.board_points[:30]
-    )
+    views = changed(cell.views, [1], corners=lambda v: v.corners.part(slice(30)))
     return observe_views(views), views.camera_from_board
 
 
@@ -63,7 +61,7 @@ def test_a_board_is_bent_as_its_numbers_say():
     cell = real_cell(np.random.default_rng(0), 3)
     observed = observe_views(cell.views)
     found = bent_points(observed, np.array(SHAPE))
-    np.testing.assert_allclose(found[0], printed(cell.views.views[0].board_points, SHAPE), atol=1e-12)
+    np.testing.assert_allclose(found[0], printed(cell.views.views[0].corners.points, SHAPE), atol=1e-12)
 
 
 def test_many_views_are_linearised_in_parts_to_the_same_bits(monkeypatch):

@@ -18,6 +18,7 @@ from calibrate.errors import (
 )
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.views.corners import NO_CORNERS
 from calibrate.views.view_set import ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp
 from tests.calibrate.cells import LOW, MID, MOUNTS, QUICK, changed, error_mm_deg, exact_motions, make_cell
@@ -136,7 +137,7 @@ def test_exact_poses_say_nothing_of_arm_and_bracket():
 
 def test_corners_in_a_line_are_refused():
     cell = make_cell(np.random.default_rng(0), 6, LOW)
-    row = {"pixels": lambda view: view.pixels[:6], "board_points": lambda view: view.board_points[:6]}
+    row = {"corners": lambda view: view.corners.part(slice(6))}
     with raises("corners-in-line", BadViewsError):
         solve_views(changed(cell.views, [2], **row))
 
@@ -166,7 +167,7 @@ def test_a_view_counts_once(with_pixels):
     """Ten views given twice would claim an error smaller by the root of two."""
     views = make_cell(np.random.default_rng(0), 10, LOW).views
     if not with_pixels:
-        bare = (replace(v, pixels=v.pixels[:0], board_points=v.board_points[:0]) for v in views)
+        bare = (replace(v, corners=NO_CORNERS) for v in views)
         views = replace(views, views=tuple(bare))
     with pytest.raises(BadViewsError) as refused:
         solve_views(views.select([*range(10), 0]))

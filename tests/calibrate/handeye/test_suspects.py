@@ -162,9 +162,7 @@ def test_forty_percent_of_moderate_errors_stay_inside_the_claim():
 
 def test_views_without_corners_have_only_a_robot():
     c = cell(5)
-    empty = changed(
-        c.views, list(range(20)), pixels=lambda v: v.pixels[:0], board_points=lambda v: v.board_points[:0]
-    )
+    empty = changed(c.views, list(range(20)), corners=lambda v: v.corners.part(slice(0)))
     flange = empty.base_from_flange
     flange[4] = flange[5]
     solution = solve_views(with_flange(empty, flange), QUICK)

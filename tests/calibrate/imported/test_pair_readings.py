@@ -21,7 +21,8 @@ from calibrate.handeye.board_motion import boards_own_motion
 from calibrate.handeye.solve import solve_views
 from calibrate.imported import Believed, Given, believe, is_described
 from calibrate.imported.directions import Told, directions, unit_named
-from calibrate.views.view_set import NO_CORNERS, BoardView, ViewSet
+from calibrate.views.corners import NO_CORNERS
+from calibrate.views.view_set import BoardView, ViewSet
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
 from recordings.geometry import inverse, pose
@@ -335,7 +336,7 @@ def test_a_recording_of_the_boards_own_poses_is_not_solved(mount: Mount) -> None
     C = Cell().truth[1]
     flange = inverse(C) if mount == "eye-in-hand" else C
     views = tuple(
-        BoardView(n, str(n), F, *NO_CORNERS, camera_from_board=T)
+        BoardView(n, str(n), F, NO_CORNERS, camera_from_board=T)
         for n, (F, T) in enumerate(zip(flange, C, strict=True))
     )
     with raises("boards-own-poses"):

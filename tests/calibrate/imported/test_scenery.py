@@ -8,6 +8,7 @@ import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.imported.scenery import mount_by_scene
+from calibrate.views.corners import Corners
 from calibrate.views.projection import project_at
 from calibrate.views.view_set import BoardView
 from recordings.geometry import pose
@@ -40,7 +41,10 @@ def pictures(
         x, y = np.clip(np.round(at).astype(int), 0, [640 - width, 480 - height])
         image[y : y + height, x : x + width] = other[:height, :width]
         images.append(
-            (image, BoardView(n, "", np.eye(4), points, project_at(CAMERA, seen, points), None, seen))
+            (
+                image,
+                BoardView(n, "", np.eye(4), Corners(points, project_at(CAMERA, seen, points)), None, seen),
+            )
         )
     return images
 

@@ -10,6 +10,7 @@ import pytest
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
+from calibrate.views.corners import Corners
 from calibrate.views.projection import project_at, undistort
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, pose, rotation_exp
@@ -29,8 +30,7 @@ def views_of(camera: CameraModel, poses: list[Array], noise_px: float = 0.1, see
             k,
             f"view-{k}",
             np.eye(4),
-            points,
-            project_at(camera, p, points) + rng.normal(size=(42, 2)) * noise_px,
+            Corners(points, project_at(camera, p, points) + rng.normal(size=(42, 2)) * noise_px),
         )
         for k, p in enumerate(poses)
     )
@@ -73,7 +73,8 @@ def test_worse_views_do_not_hide_the_less_bad_ones() -> None:
     views = views_of(CAMERA, around(15), 0.05)
     rng = np.random.default_rng(0)
     shaken = (
-        replace(v, pixels=v.pixels + rng.normal(0, s, (42, 2))) for v, s in zip(views, noise_px, strict=True)
+        replace(v, corners=replace(v.corners, pixels=v.corners.pixels + rng.normal(0, s, (42, 2))))
+        for v, s in zip(views, noise_px, strict=True)
     )
     found = calibrate_intrinsics(replace(views, views=tuple(shaken)))
     assert set(found.dropped) == set(range(5, 15))

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from benchmarks.scene import random_rotation
 from calibrate.boards.model import board_from_turned, board_points
 from calibrate.lens.pnp import candidate_poses, choose_candidates, solve_pnp
+from calibrate.views.corners import Corners
 from calibrate.views.projection import project
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.geometry import Array, inverse, perturb, pose, rotation_angle, transform_points
@@ -82,7 +83,7 @@ def test_one_sure_picture_does_not_decide_for_the_doubtful_ones() -> None:
         far = len(views) >= 8
         C = looking(MARKED, rng, (0.1, 0.25) if far else (0.3, 0.6), 4.0 if far else 0.4, np.pi)
         pixels = project(CAMERA, transform_points(C, points)).pixels + rng.normal(size=(len(points), 2)) * 0.3
-        view = BoardView(len(views), "", P @ inverse(X @ C), points, pixels)
+        view = BoardView(len(views), "", P @ inverse(X @ C), Corners(points, pixels))
         readings = [found.camera_from_board for found in candidate_poses(view, CAMERA, MARKED)]
         off = [float(rotation_angle(found[:3, :3].T @ C[:3, :3])) for found in readings]
         if far and not (len(off) == 2 and off[0] > 0.15 > 3 * off[1]):

@@ -53,7 +53,7 @@ def test_a_symmetric_board_solves_by_the_robots_motion(tmp_path: Path) -> None:
     path = write_session(tmp_path / "s.mcap", scene, known_lens=True)
     job = solve_recording(path)
     turned = [
-        not np.allclose(a.board_points, b.board_points)
+        not np.allclose(a.corners.points, b.corners.points)
         for a, b in zip(job.loaded.views, job.views, strict=True)
     ]
     assert 0 < sum(turned) < len(turned), "the scene does not show what it should"

@@ -110,7 +110,7 @@ def test_poses_are_read_by_a_convention_and_a_board_as_typed(given: dict[str, An
 
 def test_corners_and_gaps_are_taken(given: dict[str, Any], solved: SolvedRecording) -> None:
     images = given["images"]
-    corners = [detect(image, given["board"]).pixels for image in images]
+    corners = [detect(image, given["board"]).corners.pixels for image in images]
     height, width = images[0].shape[:2]
     size = given["camera"] or CameraModel(width, height)
     blank = [*corners[:-1], None]

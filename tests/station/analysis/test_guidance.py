@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.views.view_set import implied_flange
+from calibrate.views.corners import Corners
+from calibrate.views.view_set import BoardView, implied_flange
 from recordings.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from recordings.schema.messages import CameraModel, Mount
 from station.analysis.guidance import NextView, next_view, rim, way_to
-from station.analysis.worker import CapturedView
 from station.cell.status import FEWEST_BY_HAND
 from station.simulation.cells import make_cell
 from tests.station.true_camera import corners_seen
@@ -19,20 +21,21 @@ MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 TRUTH = make_cell("paper", seed=3, noise="mid")
 BOARD, LENS = TRUTH.board, TRUTH.camera
 BLANK = CameraModel(LENS.width, LENS.height)
-MIDDLE = board_points(BOARD).mean(axis=0)
+POINTS = board_points(BOARD)
+MIDDLE = POINTS.mean(axis=0)
 STRAIGHT = pose(np.eye(3), np.array([0.0, 0.0, 0.5]) - MIDDLE)
 
 
-def seen(C: Array, index: int = 0, flange: Array | None = None) -> CapturedView:
+def seen(C: Array, index: int = 0, flange: Array | None = None) -> BoardView:
     pixels = corners_seen(TRUTH, C, np.random.default_rng(index))
-    return CapturedView(index, np.eye(4) if flange is None else flange, np.arange(len(pixels)), pixels)
+    return BoardView(index, f"p{index}", np.eye(4) if flange is None else flange, Corners(POINTS, pixels))
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_who_follows_it_from_nothing_finds_the_camera(mount: Mount) -> None:
     truth = make_cell("paper", seed=3, noise="mid", mount=mount)
     X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
-    views: list[CapturedView] = []
+    views: list[BoardView] = []
     for k in range(FEWEST_BY_HAND):
         wanted = next_view(mount, BOARD, BLANK, False, views)
         assert (wanted.outline > 0).all() and (wanted.outline < [LENS.width, LENS.height]).all()
@@ -47,7 +50,7 @@ def test_who_follows_it_from_nothing_finds_the_camera(mount: Mount) -> None:
     assert np.linalg.norm(off[:3]) < 0.002 and np.linalg.norm(off[3:]) < 0.003
     assert not way_to(wanted, views[5]).new
     without, elsewhere = views[:-1], views[-1].base_from_flange + np.eye(4, k=3) * 0.1
-    wrong = CapturedView(views[-1].index, elsewhere, views[-1].indices, views[-1].pixels)
+    wrong = replace(views[-1], base_from_flange=elsewhere)
     known, same = (next_view(mount, BOARD, BLANK, False, seen) for seen in (without, [*without, wrong]))
     assert same.after_m == pytest.approx(known.after_m, rel=0.04), "what contradicts the others tells nothing"
 

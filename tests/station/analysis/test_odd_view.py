@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
+from calibrate.views.corners import Corners
+from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from recordings.schema.messages import Mount
 from station.analysis.estimation import running_estimate
 from station.analysis.found_cell import FEWEST, find_cell, odd_view
-from station.analysis.worker import CapturedView
 from station.simulation.cells import cell_config, make_cell
 from station.simulation.truth import CellTruth
 from tests.station.quick_plan import quick_plan
@@ -33,17 +34,17 @@ def w_first(T: Array) -> Array:
     return changed
 
 
-def views_of(truth: CellTruth, count: int, pose_noise: float = POSE_NOISE) -> list[CapturedView]:
+def views_of(truth: CellTruth, count: int, pose_noise: float = POSE_NOISE) -> list[BoardView]:
     """Of an arm with this noise, m and rad."""
     places = quick_plan(cell_config(truth), truth, seed=3, count=count).poses
     flanges = [np.array(place.base_from_flange) for place in places]
-    rng, corners = np.random.default_rng(2), np.arange(len(board_points(truth.board)))
+    rng, points = np.random.default_rng(2), board_points(truth.board)
     return [
-        CapturedView(
+        BoardView(
             index,
+            f"p{index}",
             perturb(flange, rng.normal(0, pose_noise, 6)),
-            corners,
-            corners_seen(truth, board_seen(truth, flange), rng),
+            Corners(points, corners_seen(truth, board_seen(truth, flange), rng)),
         )
         for index, flange in enumerate(flanges)
     ]
@@ -69,7 +70,7 @@ def test_what_cannot_be_is_named_and_what_can_is_not(mount: Mount) -> None:
     blank = msgspec.structs.replace(truth.camera, matrix=None, distortion=())
     seen = views_of(truth, FEWEST + 1)
 
-    def changed(count: int, change: Callable[[Array], Array], at: slice) -> list[CapturedView]:
+    def changed(count: int, change: Callable[[Array], Array], at: slice) -> list[BoardView]:
         views = seen[:count]
         for view in views[at]:
             views[view.index] = replace(view, base_from_flange=change(view.base_from_flange))

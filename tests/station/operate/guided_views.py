@@ -6,10 +6,10 @@ import numpy as np
 
 from calibrate.arms.kinematics import MODELS, forward
 from calibrate.boards.model import board_points
-from calibrate.views.view_set import implied_flange
+from calibrate.views.corners import Corners
+from calibrate.views.view_set import BoardView, implied_flange
 from recordings.geometry import Array, pose, rotation_exp, transform_points
 from recordings.schema.messages import RobotIdentity
-from station.analysis.worker import CapturedView
 from station.cell.config import CameraChoice
 from station.operate.draft import Draft
 from station.simulation.truth import CellTruth
@@ -39,11 +39,11 @@ def guided_joints(truth: CellTruth) -> list[Array]:
     return found
 
 
-def seen_by_hand(truth: CellTruth, joints: Array, index: int) -> CapturedView:
+def seen_by_hand(truth: CellTruth, joints: Array, index: int) -> BoardView:
     """Give what the true camera sees from there, with noise of 0.1 px."""
     flange = forward(MODELS[truth.robot_model], joints)
     pixels = corners_seen(truth, board_seen(truth, flange), np.random.default_rng(index))
-    return CapturedView(index, flange, np.arange(len(pixels)), pixels)
+    return BoardView(index, f"p{index}", flange, Corners(board_points(truth.board), pixels))
 
 
 def draft_of(truth: CellTruth, views: int = 4) -> Draft:

@@ -47,8 +47,8 @@ class Daemon:
         view = seen_from(self.truth, flange, self.board)
         self.observation = Observation(
             base_from_flange=matrix4(flange),
-            corners=tuple(range(len(view.pixels))),
-            pixels=tuple((float(u), float(v)) for u, v in view.pixels),
+            corners=tuple(range(len(view.corners))),
+            pixels=tuple((float(u), float(v)) for u, v in view.corners.pixels),
         )
         self.observation = msgspec.structs.replace(self.observation, **changes)
         self.robot, self.photographer = msgspec.structs.replace(ROBOT, tcp_offset=PENDANT), CAMERA

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,9 +12,11 @@ import numpy as np
 import pytest
 
 from calibrate.arms.kinematics import MODELS, forward
+from calibrate.boards.model import board_points
+from calibrate.views.corners import Corners
 from recordings.reader import open_recording
 from station.analysis.estimation import seen_before
-from station.analysis.worker import BoardDetection, sight
+from station.analysis.worker import sight
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Retake
@@ -44,7 +47,8 @@ class WorkerThatSees(WorkerInThisProcess):
         seen = np.sort(
             self.noise.permutation(len(pixels))[int(scale < 1) :]
         )  # each glimpse lacks another corner
-        return BoardDetection(self.sees.status, seen, (pixels[seen] + 0.5) * scale - 0.5)
+        corners = Corners(board_points(TRUTH.board), pixels).part(seen).scaled(scale)
+        return replace(self.sees, detection=replace(self.sees.detection, corners=corners))
 
 
 @pytest.fixture(scope="module")

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import Any
 from unittest.mock import Mock
 
-import msgspec
 import pytest
 
+from calibrate.views.corners import NO_CORNERS
 from recordings.errors import MissingSegmentError, RecordingError
 from recordings.reader import open_recording
 from recordings.recorder import Recorder
 from recordings.schema.messages import Image
+from station.analysis.worker import Sighting
 from station.cell.errors import CameraError, SafetyStopError, TriggerError
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Retake
@@ -38,9 +40,9 @@ async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: R
 
 
 async def test_a_picture_without_the_board_does_not_count(rig: Rig) -> None:
-    shown = rig.worker.sees
-    hidden = msgspec.structs.replace(shown.status, found=False, corners=0, reason="board half hidden")
-    rig.worker.sees = type(shown)(hidden, shown.indices[:0], shown.pixels[:0])
+    shown = rig.worker.sees.detection
+    hidden = replace(shown, cause="not-found", reason="board half hidden", corners=NO_CORNERS)
+    rig.worker.sees = Sighting(hidden)
     await rig.go_until(S.PAUSED)
     status = rig.session.store.status
     assert rig.pose_states == ["failed"] * 3 + ["planned"]

@@ -9,14 +9,15 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
+from calibrate.views.corners import Corners
 from recordings.errors import CodedError
 from recordings.geometry import base_from_flange
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.analysis.pool import WorkerError
-from station.analysis.worker import BoardDetection
 from station.cell.errors import CameraError
-from station.cell.status import NO_IMAGE, NOT_LOOKED, DetectionStatus
+from station.cell.status import NO_IMAGE, NOT_LOOKED
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from station.session import previews
@@ -29,7 +30,8 @@ TAG = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)
 
 @pytest.fixture(autouse=True)
 def tag_in_sight(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = BoardDetection(DetectionStatus(found=True), np.arange(4), 100 + 2000 * board_points(TAG)[:, :2])
+    points = board_points(TAG)
+    seen = Detection("", "", Corners(points, 100 + 2000 * points[:, :2]), len(points), 1280, 1024, 0.0, 0.1)
     monkeypatch.setattr(previews, "detect", lambda *args: seen)
 
 

@@ -62,7 +62,7 @@ async def test_pictures_show_the_board_from_the_true_pose_at_mid_exposure(
     seen = detect(picture.pixels, cell.board)
     assert seen.found, seen.reason
     ray = view[:3, 3]
-    first = seen.pixels[np.flatnonzero(seen.indices == 0)[0]]
+    first = seen.corners.pixels[np.flatnonzero(seen.corners.ids == 0)[0]]
     expected = [cell.camera.matrix[i][i] * ray[i] / ray[2] + cell.camera.matrix[i][2] for i in range(2)]
     assert np.linalg.norm(first - expected) < 3.0, "distortion moves it by a pixel or two at most"
 

@@ -83,7 +83,7 @@ def test_rows_of_the_board_along_the_pixel_rows_are_as_exact_as_others() -> None
         seen = detect(render(CAMERA, PAPER_BOARD, view, NO_NOISE), PAPER_BOARD)
         assert seen.found
         truth = projected(PAPER_BOARD, view)
-        errors.append(min((seen.pixels - t for t in (truth, truth[::-1])), key=np.linalg.norm))
+        errors.append(min((seen.corners.pixels - t for t in (truth, truth[::-1])), key=np.linalg.norm))
     assert np.sqrt((np.concatenate(errors) ** 2).mean()) < 0.03
 
 
@@ -106,7 +106,7 @@ def test_every_board_is_detected_where_it_is(name: str, lens: CameraModel) -> No
         truth = projected(board, view, lens)
         # A grid that looks the same upside down may be read from its other end.
         orders = [truth, truth[::-1]] if 2 in looks_same_turns(board) else [truth]
-        error = min((seen.pixels - points[seen.indices] for points in orders), key=np.linalg.norm)
+        error = min((seen.corners.pixels - points[seen.corners.ids] for points in orders), key=np.linalg.norm)
         # Centres of circles are seen a little off by perspective; everything else is exact.
         assert np.sqrt((error**2).mean()) < (0.25 if "circles" in name else 0.12)
 

@@ -25,10 +25,11 @@ from calibrate.pipeline.job import (
     solver_options,
     with_board_poses,
 )
+from calibrate.views.corners import MAIN_BOARD
 from calibrate.views.view_set import ViewSet
 from recordings.geometry import difference
 from recordings.importers.folder import import_folder
-from recordings.schema.messages import CameraModel
+from recordings.schema.messages import CameraIdentity, CameraModel
 from tests.calibrate.cells import error_mm_deg, inside
 from tests.calibrate.sessions import CAMERA, SYMMETRIC_BOARD, X_TRUE, Scene, write_session
 from tests.codes import raises
@@ -60,6 +61,14 @@ def test_a_symmetric_board_solves_by_the_robots_motion(tmp_path: Path) -> None:
     mm, degrees = error_mm_deg(job.solution.matrix, X_TRUE)
     assert mm < 1.0
     assert degrees < 0.15
+
+
+def test_what_the_solver_kept_says_of_which_camera_and_board_it_is(tmp_path: Path) -> None:
+    scene = Scene(board=SYMMETRIC_BOARD, mount="eye-to-hand", seed=17, roll_rad=3.1)
+    identity = CameraIdentity("rendered", "MER", "17", name="wrist")
+    path = write_session(tmp_path / "s.mcap", scene, known_lens=True, camera_identity=identity)
+    corners = [view.corners for view in solve_recording(path).solution.kept]
+    assert corners and {(each.camera, each.board) for each in corners} == {("wrist", MAIN_BOARD)}
 
 
 def test_a_wrong_square_size_is_found_and_said(real_session_file: Path, solved_real: SolvedRecording) -> None:

@@ -114,6 +114,26 @@ def test_it_is_taken_up_where_it_was_left(done: tuple[Draft, object], tmp_path: 
     assert drafts.load_draft(tmp_path) == Draft()
 
 
+def test_the_file_of_a_draft_keeps_of_its_views_what_was_measured(
+    done: tuple[Draft, object], tmp_path: Path
+) -> None:
+    """A file that an earlier version left is taken up, and an earlier version takes this one's up."""
+    draft, _ = done
+    drafts.save_draft(tmp_path, draft)
+    file = tmp_path / drafts.DRAFT_FILE
+    left = msgspec.json.decode(file.read_bytes())
+    view = draft.views[0]
+    assert left["views"][0] == {
+        "index": 0,
+        "base_from_flange": view.base_from_flange.tolist(),
+        "indices": list(range(len(view.corners))),
+        "pixels": view.corners.pixels.tolist(),
+    }
+    for name, value in (("indices", [1000]), ("pixels", [1.0]), ("index", "first")):
+        file.write_bytes(msgspec.json.encode(left | {"views": [left["views"][0] | {name: value}]}))
+        assert drafts.load_draft(tmp_path) == Draft()
+
+
 def test_a_board_is_typed_as_people_write_it() -> None:
     board = typed_board("8×5 30mm")
     assert (board.columns, board.rows, board.square_m) == (8, 5, 0.03)

@@ -23,6 +23,7 @@ ROOMS = {
     "boards": "Boards",
     "lens": "Lens",
     "handeye": "Poses and motion",
+    "views": "Poses and motion",
     "files": "Calibration files and installation",
     "check": "Checks of an installed calibration",
     "batch": "Many recordings",

@@ -40,9 +40,9 @@ class Corners:
     """Name of the camera."""
 
     def __post_init__(self) -> None:
-        with contextlib.suppress(TypeError):  # of pixels that are no rows; the view says so
+        with contextlib.suppress(TypeError):  # of points that are no rows; the view says so
             if not len(self.ids):
-                object.__setattr__(self, "ids", np.arange(len(self.pixels)))
+                object.__setattr__(self, "ids", np.arange(len(self.points)))
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -61,12 +61,12 @@ class Corners:
 
     def checked(self, image: str) -> Corners:
         """Copy them as arrays of the right shapes. Raises BadViewsError (`shape`), which names the image."""
-        pixels = array_of(self.pixels, (-1, 2), f"pixels of {image}")
+        points = array_of(self.points, (-1, 3), f"points of {image}")
         return replace(
             self,
-            points=array_of(self.points, (-1, 3), f"points of {image}"),
-            pixels=pixels,
-            ids=_ids_of(self.ids, len(pixels), f"ids of {image}"),
+            points=points,
+            pixels=array_of(self.pixels, (-1, 2), f"pixels of {image}"),
+            ids=_ids_of(self.ids, len(points), f"ids of {image}"),
         )
 
 

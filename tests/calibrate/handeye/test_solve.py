@@ -181,8 +181,7 @@ def test_a_view_counts_once(with_pixels):
 def broken(field, value):
     cell = make_cell(np.random.default_rng(0), 8, LOW)
     views = list(cell.views.views)
-    fields = ("pixels", "board_points") if field == "both" else (field,)
-    views[3] = replace(views[3], **{name: value(np.array(getattr(views[3], name))) for name in fields})
+    views[3] = replace(views[3], **{field: value(getattr(views[3], field))})
     return replace(cell.views, views=tuple(views))
 
 
@@ -199,9 +198,9 @@ def mirrored(C):
         ("camera_from_board", lambda C: None, "no-board-pose"),
         ("camera_from_board", mirrored, "board-pose"),
         ("camera_from_board", lambda C: C @ pose(np.eye(3), [0, 0, -9.0]), "board-pose"),
-        ("pixels", lambda p: p * np.nan, "corners"),
-        ("pixels", lambda p: p[:-1], "corners"),
-        ("both", lambda p: p[:3], "corners"),
+        ("corners", lambda seen: replace(seen, pixels=seen.pixels * np.nan), "corners"),
+        ("corners", lambda seen: replace(seen, pixels=seen.pixels[:-1]), "corners"),
+        ("corners", lambda seen: seen.part(slice(3)), "corners"),
     ],
 )
 def test_a_broken_view_is_named(profile, field, value, code):

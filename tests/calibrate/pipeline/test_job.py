@@ -67,7 +67,7 @@ def test_what_the_solver_kept_says_of_which_camera_and_board_it_is(tmp_path: Pat
     scene = Scene(board=SYMMETRIC_BOARD, mount="eye-to-hand", seed=17, roll_rad=3.1)
     identity = CameraIdentity("rendered", "MER", "17", name="wrist")
     path = write_session(tmp_path / "s.mcap", scene, known_lens=True, camera_identity=identity)
-    corners = [view.corners for view in solve_recording(path).solution.kept]
+    corners = [view.corners for view in solve_recording(path).solution.evidence.kept]
     assert corners and {(each.camera, each.board) for each in corners} == {("wrist", MAIN_BOARD)}
 
 

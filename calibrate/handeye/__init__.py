@@ -12,7 +12,8 @@
     for view in solution.evidence.views.rejected:
         print(view.index, view.kind, view.reason)
 
-With corners (`Corners`) in each `BoardView` and a camera, the same call also estimates lens, board shape and arm.
+With corners (`Corners`) in each `BoardView` and a camera, the same call also estimates lens, board shape and
+arm.
 `compare_all` puts the published methods beside it, `view_information` tells what poses would show before
 they are recorded. Errors are `calibrate.errors.CalibrationError`s with `code`, `values` and `remedy`.
 Everything else is private. Names are loaded at their first use.

@@ -63,7 +63,7 @@ def test_table_errors_are_found_and_coverage_comes_back():
         shift_mm, turn_mrad = found.fit.arm.stated.size_mm, found.fit.arm.stated.size_mrad
         assert 0.1 < shift_mm < 1.0 and 0.1 < turn_mrad < 1.0 and shift_mm != turn_mrad
         assert "arm-systematics" in {remark.code for remark in found.judgement.warnings}
-        assert found.evidence.views.rejected == ()
+        assert found.evidence.views.rejected == []
         held["with"] += inside(found, worn.X)
         plain = without_arm(worn.views)
         off = difference(plain.state.X, worn.X)
@@ -184,7 +184,8 @@ def test_an_arm_nobody_described_is_honest_and_better_by_its_joints(name, mount)
         solved = [solve_views(views, QUICK) for views in (cell.views, without_joints(cell.views))]
         covered.append(inside(solved[0], cell.X))
         errors.append([error_mm_deg(solution.matrix, cell.X)[0] for solution in solved])
-        assert solved[0].arm.stated.applied and solved[0].arm.uncorrected is not None
+        arm = solved[0].fit.arm
+        assert arm.stated.applied and arm.uncorrected is not None
     with_joints, without = np.sqrt(np.mean(np.square(errors), axis=0))
     assert all(covered) and with_joints < 0.8 * without
 

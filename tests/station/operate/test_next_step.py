@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from calibrate.files.calibration import Calibration, RejectedView
+from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch
-from calibrate.results import Gate
+from calibrate.results import Gate, RejectedView
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.operate.next_step import StepKind, after_solve
 from tests.station.calibrated_cell import calibration_of

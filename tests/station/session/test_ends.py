@@ -171,11 +171,11 @@ async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
 async def test_a_defect_in_the_estimate_costs_one_estimate(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     call, asked = rig.worker.call, []
 
-    async def broken(function: Any, *args: Any, timeout_s: float = 60.0) -> Any:
+    async def broken(function: Any, *args: Any, **named: Any) -> Any:
         if function is running_estimate:
             asked.append(1)
             raise IndexError("a defect")
-        return await call(function, *args, timeout_s=timeout_s)
+        return await call(function, *args, **named)
 
     monkeypatch.setattr(rig.worker, "call", broken)
     await rig.go_until(S.IDLE)

@@ -19,6 +19,7 @@ from calibrate.handeye.board_motion import BoardMotion, board_extent_m, boards_o
 from calibrate.handeye.changes import ChangeSearch, errors_by_posture
 from calibrate.handeye.pose_fit import (
     FREE,
+    BoardPoses,
     PoseFit,
     PoseViews,
     agreed_start,
@@ -30,7 +31,7 @@ from calibrate.handeye.readings import clear_gain, explain_recording, explain_te
 from calibrate.handeye.solution import Explanation, Reading
 from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates, with_poses
-from calibrate.views.view_set import ViewSet
+from calibrate.views.view_set import Places, ViewSet
 from recordings.errors import ImportSourceError, StandingReading, several_readings
 from recordings.geometry import Array, inverse, rotation_angle, rotation_log
 from recordings.importers.conventions import Convention, convention, possible, tells_direction
@@ -267,30 +268,46 @@ def _leading(one: TableReading, readings: list[TableReading]) -> TableReading | 
     poses = _pose_views(one.views, one.seen)
     H = mount_poses(one.views.base_from_flange, one.mount)
     needed = max(_FEWEST_SURE, round(_SURE * len(H)))
+    if len(H) < needed:
+        return None
     rng = np.random.default_rng(0)
     best = np.zeros(len(H), dtype=bool)
     for _ in range(_STARTS):
-        few = rng.permutation(len(H))[:_FEW]
-        start = agreed_start(H[few], poses.boards.part(few), 0)
-        X, factors = start.X, start.factors
-        for _ in range(_STEPS):
-            places = H @ X @ poses.boards.at(factors)
-            away = pose_distances(places, places)
-            middle = away[np.sort(away, axis=1)[:, needed - 1].argmin()]
-            nearest = np.argsort(middle)[:needed]
-            if middle[nearest[-1]] < _STAYS_M:
-                break
-            start = agreed_start(H[nearest], poses.boards.part(nearest), 0)
-            X, factors = start.X, start.factors
-        alike = middle < _STAYS_M
+        alike = _alike(H, poses.boards, rng.permutation(len(H))[:_FEW], needed)
         best = alike if alike.sum() > best.sum() else best
     if best.sum() < needed:
         return None
-    fit = fit_poses(poses.part(np.flatnonzero(best)))
+    try:
+        fit = fit_poses(poses.part(np.flatnonzero(best)))
+    except np.linalg.LinAlgError:
+        return None
     away_m, away_rad = _away(fit, H, poses)
     inliers = (away_m < _STAYS_M) & (away_rad < _STAYS_RAD)
     found = replace(one, fit=fit, away_m=away_m[inliers], away_rad=away_rad[inliers], inliers=inliers)
     return found if _is_possible(found) and inliers.sum() >= _FEWEST_SURE else None
+
+
+def _alike(H: Array, boards: BoardPoses, few: Places, needed: int) -> NDArray[np.bool_]:
+    """Find the views (n,) whose boards lie at one place by an X that begins with those at the places `few`.
+
+    In each step X is found anew by the `needed` views whose boards lie nearest together, until these lie at
+    one place or fix no X.
+    """
+    alike = np.zeros(len(H), dtype=bool)
+    views = few
+    for _ in range(_STEPS):
+        try:
+            start = agreed_start(H[views], boards.part(views), 0)
+        except np.linalg.LinAlgError:
+            break
+        places = H @ start.X @ boards.at(start.factors)
+        away = pose_distances(places, places)
+        middle = away[np.sort(away, axis=1)[:, needed - 1].argmin()]
+        views = np.argsort(middle)[:needed]
+        alike = middle < _STAYS_M
+        if alike[views[-1]]:
+            break
+    return alike
 
 
 def _away(fit: PoseFit, H: Array, poses: PoseViews) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ from calibrate.imported import Given, believe, board
 from calibrate.imported.described import described
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
-from recordings.geometry import pose, rotation_exp
+from recordings.geometry import pose, quaternion_from_matrix, rotation_exp
 from recordings.importers import reader
 from recordings.importers.tables import look
 from recordings.reader import open_recording
@@ -868,3 +868,30 @@ def test_inputs_that_once_went_wrong_are_asked_about() -> None:
     ):
         with raises(code):
             believe(look(FAILING / name / "data"))
+
+
+def left_handed(flange: np.ndarray) -> list[float]:
+    """Position and quaternion in a frame whose y is turned over, as Unity and Unreal have it."""
+    x, y, z = flange[:3, 3]
+    qx, qy, qz, qw = quaternion_from_matrix(flange[:3, :3])
+    return [x, -y, z, -qx, qy, -qz, qw]
+
+
+def test_poses_of_a_left_handed_frame_are_refused_without_a_word_on_the_board(
+    shots: Shots, tmp_path: Path
+) -> None:
+    """With the size of the board left open, and with fewer views than must agree against outliers."""
+    for view in range(VIEWS):
+        shots.save(tmp_path / f"images/img_{view:02}.jpg", "one", view)
+    rows = [left_handed(flange) for flange in shots.flanges["one"]]
+    np.savetxt(tmp_path / "poses.csv", rows, delimiter=",")
+    with raises("no-reading"):
+        believe(look(tmp_path))
+
+
+@pytest.mark.skipif(not FAILING.is_dir(), reason="other people's folders are not here")
+def test_few_views_that_fix_no_camera_pose_end_in_the_cause() -> None:
+    """Of a left-handed frame, too: where the board's size is open, some views give one below zero."""
+    folder = FAILING / "left-handed-poses-said-mirrored-images/data"
+    with raises("no-reading"):
+        believe(look(folder))

@@ -846,6 +846,14 @@ def test_kalibrs_grid_of_tags_is_read() -> None:
     assert (board_read.square_m, board_read.marker_m) == (0.088, pytest.approx(0.0264))
 
 
+def test_a_charuco_board_is_looked_for_in_both_patterns() -> None:
+    """OpenCV drew boards with an even number of rows otherwise before version 4.6."""
+    told = {"rows": 8, "columns": 6, "square_size": 0.03, "marker_size": 0.022, "dictionary": "DICT_5X5_100"}
+    boards = described(told).boards
+    assert {board.kind for board in boards} == {BoardKind.CHARUCO}
+    assert {board.legacy for board in boards} == {False, True}
+
+
 # ---- what others left
 
 RIGHT = ("csv-with-header-names-not-used", "date-behind-the-pose", "one-folder-a-pose")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.arms.kinematics import forward
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.pipeline.job import solve_recording
+from calibrate.pipeline.job import JobOptions, solve_recording
 from calibrate.pipeline.recorded_views import arm_of_ros, load_views
 from calibrate.report import html
 from calibrate.report.page import report_page
@@ -24,7 +24,7 @@ from recordings.images import encode_png
 from recordings.manifest import enter_part
 from recordings.reader import Recording, open_recording
 from recordings.recover import recover_recording
-from recordings.schema.messages import RobotIdentity
+from recordings.schema.messages import CameraModel, RobotIdentity
 from recordings.writer import RecordingWriter
 from tests.codes import raises
 
@@ -134,6 +134,32 @@ def test_a_board_declared_in_squares_is_named_with_its_inner_corners(
     squares = msgspec.structs.replace(board, columns=board.columns + 1, rows=board.rows + 1)
     with raises("squares-counted", TooFewViewsError, columns=board.columns, rows=board.rows):
         load_views(few, squares)
+
+
+def test_the_size_of_the_pictures_is_theirs_where_nobody_told_it(source: Recording) -> None:
+    (_, picture), *_ = source.images()
+    height, width = picture.pixels.shape[:2]
+    camera = load_views(source, camera=CameraModel(0, 0)).views.camera
+    assert (camera.width, camera.height) == (width, height)
+    assert width != height
+
+
+def test_a_view_that_is_left_out_does_not_bind_the_clocks(source: Recording, tmp_path: Path) -> None:
+    """The gate judges the times of used views alone."""
+    path = tmp_path / "late.mcap"
+    with RecordingWriter(path, source.info) as writer:
+        for view, picture in source.images():
+            writer.image(picture, encoded=encode_png(picture.pixels))
+            bound_s = 0.5 if view.index == 2 else 0.001
+            writer.view(msgspec.structs.replace(view, time_bound_s=bound_s))
+        path = writer.finish()
+
+    def bound_s(without: tuple[int, ...]) -> float | None:
+        gates = solve_recording(path, JobOptions(without=without)).gates
+        return next(gate.value for gate in gates if gate.name == "clock_bound_s")
+
+    assert bound_s(()) == 0.5
+    assert bound_s((3,)) == 0.001
 
 
 def test_pictures_without_poses_are_refused(source: Recording, tmp_path: Path) -> None:

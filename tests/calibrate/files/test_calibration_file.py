@@ -92,10 +92,21 @@ def test_a_result_that_contradicts_itself_is_refused_even_with_a_right_hash(
     skewed = msgspec.structs.replace(
         good.result, matrix=tuple(tuple(2.0 * v for v in row) for row in good.result.matrix)
     )
-    for result in (moved, swapped, skewed):
+    turned = msgspec.structs.replace(good.result, rotation_xyzw=(0.0, 0.0, 0.0, 1.0))
+    for result in (moved, swapped, skewed, turned):
         content = encode_calibration(msgspec.structs.replace(good, result=result))
         with raises("contradiction", CalibrationFileError):
             decode_calibration(content, "x")
+
+
+@pytest.mark.parametrize("size", [0, 3, 7])
+def test_a_covariance_of_another_size_is_refused_even_with_a_right_hash(
+    solved_real: SolvedRecording, size: int
+) -> None:
+    rows = tuple(tuple(1e-8 * (i == k) for k in range(size)) for i in range(size))
+    content = encode_calibration(msgspec.structs.replace(solved_real.calibration, covariance=rows))
+    with raises("contradiction", CalibrationFileError):
+        decode_calibration(content, "x")
 
 
 @pytest.mark.parametrize(("row", "column", "value"), [(0, 0, -1e-6), (0, 1, 1e-6), (2, 2, float("inf"))])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -250,6 +251,28 @@ def test_a_program_loads_a_file_that_software_of_the_first_format_installed(tmp_
     assert read_calibration(found.path).format == FORMATS[-1]
     assert found.plain["format"] == FORMATS[-1]
     assert (found.transform.parent, found.transform.child) == ("flange", "camera")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("mount", "eye-to-hand"),
+        ("covariance", [[1e-8]]),
+        ("confidence_threshold", "twelve"),
+    ],
+)
+def test_a_program_refuses_an_installed_file_that_cannot_be(key: str, value: Any, tmp_path: Path) -> None:
+    """Its hash and its name are right."""
+    install(FORMAT_1, tmp_path, cell="simulated")
+    content = with_hash(strict_yaml.load_plain(FORMAT_1.read_bytes()) | {key: value})
+    folder = tmp_path / "calibrations"
+    named = Path("gen") / f"0001-{hashlib.sha256(content).hexdigest()[:8]}.yaml"
+    (folder / "current").unlink()
+    (folder / named).write_bytes(content)
+    (folder / "current").symlink_to(named)
+    expected = refusal(read_calibration, folder / named)
+    assert expected
+    assert refusal(load_installed, tmp_path, True) == expected
 
 
 def test_lifting_changes_nothing_of_todays(whole_plain: dict[str, Any]) -> None:

@@ -257,7 +257,8 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
     The fit starts at the estimate of all views. That saves steps and does not change the optimum.
     """
     used = np.flatnonzero(fit.estimate.used)
-    first, last = used[:-HELD_OUT], used[-HELD_OUT:]
+    first = used[:-HELD_OUT]
+    last = used[-HELD_OUT:]
     if len(first) < FEWEST_FITTED:
         return None
     whole = fit.estimate

@@ -18,9 +18,10 @@ DICTIONARIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL"
 """Ends of the names of OpenCV's dictionaries, each the largest of its kind."""
 _SMALLER = (50, 100, 250, 1000)
 """Markers of the dictionaries of one kind: each begins with the markers of the smaller ones."""
-_SQUARE_PX, _LARGEST_FACTOR = 60.0, 3.0
-"""Images are enlarged until a square has so many pixels, at most so many times: else small markers are not
-seen."""
+_SQUARE_PX = 60.0
+"""Images are enlarged until a square has so many pixels: else small markers are not seen."""
+_LARGEST_FACTOR = 3.0
+"""They are enlarged at most so many times."""
 _OFF_CENTRE = 0.2
 """A marker's middle lies nearer to that of its square, in squares."""
 _SHARES = 0.3, 0.95

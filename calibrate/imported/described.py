@@ -6,11 +6,12 @@ Facts are keys with their values: `board_width: 9`, and `chessboard_size: 0.025`
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 import cv2
 
@@ -51,6 +52,9 @@ _SIZE = re.compile(r"(?<![\w.])(\d{1,2}) ?(?:[x×*]|by) ?(\d{1,2})(?!\w|\.\d)")
 _LARGEST_METRES = 1.0
 """A larger number without a unit is one of millimetres."""
 _SIDES_LIMIT = 60
+"""No board has so many columns or rows."""
+_WIDEST_GAP = 10.0
+"""Sides of tags that the gap between two of a grid is never."""
 _SQUARES_M = 0.002, 0.5
 """Sides of squares for which a key without the word is believed."""
 
@@ -116,11 +120,14 @@ def _typed(facts: dict[str, Any]) -> Iterator[BoardSpec]:
 
 def _april_grids(facts: dict[str, Any]) -> Iterator[BoardSpec]:
     """The grid of tags of Kalibr's target.yaml: the gap between tags is told as a share of their side."""
-    keys = ("tag_cols", "tag_rows", "tag_size", "tag_spacing")
-    told = [float(facts[key]) for key in keys if _is_number(facts.get(key))]
-    if len(told) == len(keys) and min(told) > 0:
-        columns, rows, side_m, gap = told
-        yield BoardSpec(BoardKind.APRIL_GRID, int(columns), int(rows), side_m, gap * side_m)
+    columns = facts.get("tag_cols")
+    rows = facts.get("tag_rows")
+    side_m = facts.get("tag_size")
+    gap = facts.get("tag_spacing")
+    if not _is_count(columns) or not _is_count(rows) or not _is_number(side_m) or not _is_number(gap):
+        return
+    if side_m > 0 and 0 < gap < _WIDEST_GAP:
+        yield BoardSpec(BoardKind.APRIL_GRID, int(columns), int(rows), float(side_m), float(gap * side_m))
 
 
 def _dictionary(facts: dict[str, Any], texts: list[str]) -> str | None:
@@ -129,7 +136,7 @@ def _dictionary(facts: dict[str, Any], texts: list[str]) -> str | None:
     if isinstance(told, str):
         return told
     names = {getattr(cv2.aruco, name): name for name in dir(cv2.aruco) if re.match(r"DICT_\d", name)}
-    if told in names:
+    if isinstance(told, int) and told in names:
         return names[told]
     named = (re.search(r"\bDICT_\w+", text) for text in texts)
     return next((found[0] for found in named if found and hasattr(cv2.aruco, found[0])), None)
@@ -249,9 +256,13 @@ def _words(key: str) -> list[str]:
     return re.findall(r"[a-z]+", key.lower())
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+def _is_number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_count(value: Any) -> TypeGuard[float]:
+    return _is_number(value) and float(value).is_integer() and 1 <= value < _SIDES_LIMIT
 
 
 def _is_two_counts(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(float(each).is_integer() for each in value)
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_count, value))

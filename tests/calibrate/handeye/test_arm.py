@@ -60,7 +60,8 @@ def test_table_errors_are_found_and_coverage_comes_back():
         worn = worn_cell(rng, 0.4)
         found = solve_views(worn.views, QUICK)
         assert found.fit.arm.stated.log_bayes > 3 and found.fit.arm.stated.applied
-        shift_mm, turn_mrad = found.fit.arm.stated.size_mm, found.fit.arm.stated.size_mrad
+        shift_mm = found.fit.arm.stated.size_mm
+        turn_mrad = found.fit.arm.stated.size_mrad
         assert 0.1 < shift_mm < 1.0 and 0.1 < turn_mrad < 1.0 and shift_mm != turn_mrad
         assert "arm-systematics" in {remark.code for remark in found.judgement.warnings}
         assert found.evidence.views.rejected == []

@@ -40,7 +40,8 @@ def test_the_held_out_views_of_a_solve_leave_its_partial_fit_alone(monkeypatch):
     views = make_cell(np.random.default_rng(0), VIEWS, MID).views
     last = list(range(VIEWS - HELD_OUT, VIEWS))
     slips = 1e-3 * np.random.default_rng(1).normal(size=(HELD_OUT, 6))
-    judged, score = [], describe.score_holdout
+    judged = []
+    score = describe.score_holdout
     monkeypatch.setattr(describe, "score_holdout", lambda X, *a: judged.append(X) or score(X, *a))
     scores = [
         solve_views(seen, SolveOptions(folds=False)).judgement.figures.holdout

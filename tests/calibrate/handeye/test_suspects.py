@@ -100,7 +100,8 @@ def test_what_is_said_of_a_view_is_its_own_where_an_earlier_one_is_rejected():
     slip = np.array([[0.02, 0.03, -0.01, 0.02, 0.05, 0.04]])
     solution = solve_views(nudged(c.views, [1], slip), QUICK)
     without = solve_views(c.views.select([i for i in range(20) if i != 1]), QUICK)
-    told, expected = solution.evidence.residuals, without.evidence.residuals
+    told = solution.evidence.residuals
+    expected = without.evidence.residuals
     assert [one.index for one in told] == [one.index for one in expected]
     for name in ("rms_px", "robot_mm", "robot_deg"):
         found = [getattr(one, name) for one in told]
@@ -120,7 +121,8 @@ def test_the_farther_off_a_view_the_less_it_counts_and_doubt_is_said():
     for size in np.arange(0.0, 15.0, 3.0):
         solution = solve_views(nudged(c.views, [7], size * SIGMA[None]), QUICK)
         weights.append(solution.evidence.weights[7])
-        rejected, doubted = 7 not in solution.evidence.views.used, 7 in solution.evidence.suspects
+        rejected = 7 not in solution.evidence.views.used
+        doubted = 7 in solution.evidence.suspects
         assert not (rejected and doubted)
         assert ("suspect-views" in {remark.code for remark in solution.judgement.warnings}) == bool(
             solution.evidence.suspects

@@ -846,6 +846,23 @@ def test_kalibrs_grid_of_tags_is_read() -> None:
     assert (board_read.square_m, board_read.marker_m) == (0.088, pytest.approx(0.0264))
 
 
+@pytest.mark.parametrize(
+    "value", [["a", "b"], [None, 3], {"x": 1}, [5], float("inf"), float("nan"), 1e300, "1e999"]
+)
+@pytest.mark.parametrize(
+    "key", ["board_size", "dictionary", "tag_cols", "tag_spacing", "square_size", "rows"]
+)
+def test_what_is_no_board_is_passed_over(key: str, value: Any) -> None:
+    """Other people's files hold anything under the keys of a board."""
+    grid = {"tag_cols": 6, "tag_rows": 5, "tag_size": 0.088, "tag_spacing": 0.3}
+    for told in (grid, {"columns": 8, "rows": 6, "square_size": 0.03}):
+        found = described(told | {key: value})
+        for each in found.boards:
+            assert 0 < each.columns < 100 and 0 <= each.rows < 100
+            assert np.isfinite(each.square_m)
+        assert np.isfinite([found.square_m, found.tag_m]).all()
+
+
 def test_a_charuco_board_is_looked_for_in_both_patterns() -> None:
     """OpenCV drew boards with an even number of rows otherwise before version 4.6."""
     told = {"rows": 8, "columns": 6, "square_size": 0.03, "marker_size": 0.022, "dictionary": "DICT_5X5_100"}

@@ -1,1 +1,1 @@
-"""Arms: the table of known kinematics, and chains that are learned from recorded joints and poses."""
+"""Arms: known kinematics, chains learned from joints and poses, and classes of arms with their errors."""

@@ -25,11 +25,13 @@ from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
+    CELL_FILE_NAME,
     UR_KINEMATICS_NAME,
     ArmKinematics,
     BoardKind,
     BoardSpec,
     CameraModel,
+    RobotIdentity,
     View,
 )
 
@@ -103,7 +105,7 @@ def load_views(
     if not (model.width and model.height):
         first = next(iter(seen.values()))
         model = msgspec.structs.replace(model, width=first.width, height=first.height)
-    found = ViewSet(info.mount, tuple(views), model, info.robot.model, _calibrated_arm(recording))
+    found = ViewSet(info.mount, tuple(views), model, told_model(recording), _calibrated_arm(recording))
     return LoadedViews(found, spec, (*missing, *by_hand), seen, recording.losses)
 
 
@@ -121,7 +123,7 @@ def _told_views(
             advice="Give more pairs of poses.",
         )
     own = tuple(_board_view(view, NO_CORNERS) for view in told)
-    found = ViewSet(info.mount, own, NOMINAL_CAMERA, info.robot.model, _calibrated_arm(recording))
+    found = ViewSet(info.mount, own, NOMINAL_CAMERA, told_model(recording), _calibrated_arm(recording))
     return LoadedViews(found, info.board, tuple(by_hand), losses=recording.losses)
 
 
@@ -129,6 +131,29 @@ def _board_view(view: View, corners: Corners) -> BoardView:
     recorded = view.joints_rad, view.camera_from_board
     joints, board = (None if numbers is None else np.array(numbers) for numbers in recorded)
     return BoardView(view.index, view.name, np.array(view.base_from_flange), corners, joints, board)
+
+
+_DEFAULT_OF_BEFORE = "UR10"
+
+
+def told_model(recording: Recording) -> str:
+    """Return the arm's model as its controller or a person told it; `unknown` where neither did.
+
+    Earlier versions took a cell file that named no model for one of a UR10, and recorded that. It holds where
+    a controller told its serial number or version, and where the attached cell file or an import names it.
+    """
+    robot = recording.info.robot
+    if robot.model != _DEFAULT_OF_BEFORE or robot.serial or robot.controller_version:
+        return robot.model
+    cell_file = recording.attachments().get(CELL_FILE_NAME)
+    return robot.model if cell_file is None or _names_model(cell_file) else RobotIdentity().model
+
+
+def _names_model(cell_file: bytes) -> bool:
+    try:
+        return "model" in strict_yaml.load_plain(cell_file)["robot"]
+    except (strict_yaml.StrictYamlError, KeyError, TypeError):
+        return False
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:

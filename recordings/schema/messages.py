@@ -107,6 +107,8 @@ class RobotIdentity(_Device, frozen=True, forbid_unknown_fields=True, omit_defau
     payload_kg: float = 0.0
 
 
+CELL_FILE_NAME = "config.yaml"
+"""Attachment of a recording: the file of the cell that made it."""
 ARM_KINEMATICS_NAME = "arm-kinematics.json"
 """Attachment of a recording: `ArmKinematics`."""
 UR_KINEMATICS_NAME = "kinematics.yaml"

@@ -9,7 +9,15 @@ import msgspec
 
 from recordings.files import MAIN_CAMERA
 from recordings.schema import stillness
-from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Matrix4, Mount, Vector6
+from recordings.schema.messages import (
+    BoardKind,
+    BoardSpec,
+    CameraModel,
+    Matrix4,
+    Mount,
+    RobotIdentity,
+    Vector6,
+)
 
 Vector3 = tuple[float, float, float]
 LARGEST_REACH_M = 5.0
@@ -65,6 +73,9 @@ class KinematicsDeltas(Section, frozen=True):
     theta_rad: Vector6 = (0.0,) * 6
 
 
+UNKNOWN_ARM = RobotIdentity().model
+"""Model of an arm that neither its controller nor a person named."""
+
 ControlPath = Literal["ur_rtde", "script"]
 """Driver of the arm: the library, or the station's own script where there is no library."""
 
@@ -72,8 +83,8 @@ ControlPath = Literal["ur_rtde", "script"]
 class RobotConfig(Section, frozen=True):
     driver: Literal["ur", "posted"] = "ur"
     """ur: a Universal Robots arm. posted: any arm, moved by a person, whose pose a program posts."""
-    model: str = "UR10"
-    """Model of the arm; of a posted one, its name"""
+    model: str = UNKNOWN_ARM
+    """Model of the arm, as its controller tells it; of a posted one, its name"""
     host: str = ""
     serial: str = ""
     """Serial number; when given, other arms are refused."""

@@ -15,7 +15,7 @@ from recordings import strict_yaml
 from recordings.files import read_file
 from recordings.schema.messages import CameraModel
 from recordings.strict_yaml import StrictYamlError, YamlProblem
-from station.cell.config import REAL_DRIVERS, CameraConfig, PoseGuess, RobotConfig, StationConfig
+from station.cell.config import REAL_DRIVERS, UNKNOWN_ARM, CameraConfig, PoseGuess, RobotConfig, StationConfig
 from station.cell.errors import ConfigError
 from station.cell.layout import arm_model
 
@@ -88,6 +88,9 @@ def _contradictions(config: StationConfig) -> Iterator[Problem]:
         for key in ("host", "kinematics", "control"):
             if getattr(robot, key):
                 yield f"robot.{key}", "is for arms that the station moves", "Leave it out, or choose `ur`."
+    elif robot.model == UNKNOWN_ARM:
+        remedy = f"Write the model that the pendant shows (menu → About), one of {', '.join(MODELS)}."
+        yield "robot.model", "nobody told which arm this is: its reach and its body depend on it", remedy
     elif robot.model not in MODELS:
         yield "robot.model", f"'{robot.model}' is not known", f"Give one of {', '.join(MODELS)}."
     elif not _is_calibrated(robot):

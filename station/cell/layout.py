@@ -23,6 +23,7 @@ from recordings.geometry import (
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.cell.collision import CellGeometry, plate
 from station.cell.config import (
+    UNKNOWN_ARM,
     Capsule,
     PoseGuess,
     RobotConfig,
@@ -144,7 +145,12 @@ def guess_from(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
 
 
 def arm_model(robot: RobotConfig) -> RobotModel:
-    """Return the configured arm, with its factory calibration if given. ConfigError: unknown model."""
+    """Return the configured arm, with its factory calibration if given.
+
+    ConfigError: `robot-model-not-told`, `unknown-robot-model`.
+    """
+    if robot.model == UNKNOWN_ARM:
+        raise ConfigError("robot-model-not-told", known=", ".join(MODELS))
     if (model := MODELS.get(robot.model)) is None:
         raise ConfigError("unknown-robot-model", model=robot.model, known=", ".join(MODELS))
     if (k := robot.kinematics) is not None:

@@ -18,6 +18,7 @@ from recordings.errors import RecordingError
 from recordings.geometry import pose_from_vector, vector_from_pose
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import (
+    CELL_FILE_NAME,
     CameraIdentity,
     FrameTime,
     Image,
@@ -29,7 +30,7 @@ from recordings.schema.messages import (
 )
 from station.cell.arm_acceptance import StopWay
 from station.cell.clock_fit import ClockFit
-from station.cell.config import StationConfig, vector6
+from station.cell.config import UNKNOWN_ARM, StationConfig, vector6
 from station.cell.config_file import guess_problems
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.pose_plan import Plan, PlannedPose
@@ -44,7 +45,6 @@ _SAME_JOINTS_RAD = 0.02
 _STAMP_BOUND_S = 1e-6
 _HOST_CLOCK = ClockFit(0.0, 0.0, _STAMP_BOUND_S)
 """Clock of played-back images: the host's own."""
-CONFIG_NAME = "config.yaml"
 
 
 class PlaybackCamera:
@@ -243,13 +243,15 @@ def playback_cell(recording: Path) -> Cell:
     RobotError or ConfigError for a recording that is damaged, has no joints or no configuration in it.
     """
     robot = PlaybackRobot(recording)
-    content = robot.recording.attachments().get(CONFIG_NAME, b"")
+    content = robot.recording.attachments().get(CELL_FILE_NAME, b"")
     try:
         recorded = strict_yaml.load(content, StationConfig)
     except strict_yaml.StrictYamlError as error:
-        raise ConfigError("no-config", recording=recording, name=CONFIG_NAME, reason=str(error)) from error
+        raise ConfigError("no-config", recording=recording, name=CELL_FILE_NAME, reason=str(error)) from error
     for key, wrong, _ in guess_problems(recorded):
-        raise ConfigError("no-config", recording=recording, name=CONFIG_NAME, reason=f"{key}: {wrong}")
+        raise ConfigError("no-config", recording=recording, name=CELL_FILE_NAME, reason=f"{key}: {wrong}")
+    told = recorded.robot.model
+    model = robot.identity.model if told == UNKNOWN_ARM else told  # files of before wrote no UR10
     camera = msgspec.structs.replace(
         recorded.camera, driver="playback", device=str(recording), trigger="software"
     )
@@ -258,7 +260,7 @@ def playback_cell(recording: Path) -> Cell:
         name="playback",
         camera=camera,
         trigger=None,
-        robot=msgspec.structs.replace(recorded.robot, host="", serial=""),
+        robot=msgspec.structs.replace(recorded.robot, model=model, host="", serial=""),
     )
     return Cell(
         config=config,

@@ -20,6 +20,7 @@ from recordings.recorder import Recorder
 from recordings.same_session import difference
 from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
+    CELL_FILE_NAME,
     CameraIdentity,
     CameraModel,
     Image,
@@ -220,7 +221,7 @@ class SessionRecording:
         try:
             enter_part(self.folder, info.name, info.part, path.name)
             recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
-            recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
+            recorder.attach(CELL_FILE_NAME, "application/yaml", self._cell.config_yaml)
             recorder.attach("camera.json", "application/json", msgspec.json.encode(settings))
             if (kinematics := self._cell.arm.kinematics) is not None:
                 recorder.attach(ARM_KINEMATICS_NAME, "application/json", msgspec.json.encode(kinematics))

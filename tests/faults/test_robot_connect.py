@@ -36,8 +36,8 @@ def arm() -> Iterator[SimulatedController]:
         check_allow_list(running.host)
 
 
-def robot_at(host: str, folder: Path, **config: Any) -> UrRobot:
-    return UrRobot(RobotConfig(host=host, **config), folder / "log")
+def robot_at(host: str, folder: Path, model: str = "UR10", **config: Any) -> UrRobot:
+    return UrRobot(RobotConfig(model=model, host=host, **config), folder / "log")
 
 
 def complaint(robot: UrRobot) -> ErrorData | None:

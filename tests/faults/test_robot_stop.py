@@ -65,7 +65,7 @@ async def test_with_a_silent_dashboard_the_child_stops_the_arm(cell: MakeCell) -
 
 
 async def test_stop_is_welcome_in_any_state(cell: MakeCell, tmp_path: Path) -> None:
-    stranger = UrRobot(RobotConfig(host="127.255.3.9"), tmp_path / "log")
+    stranger = UrRobot(RobotConfig(model="UR10", host="127.255.3.9"), tmp_path / "log")
     await stranger.stop("never connected")
     await stranger.link.close()
     c = await cell(control=False)

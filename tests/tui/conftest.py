@@ -59,7 +59,7 @@ SUMMARY = MotionPreview(
 
 
 CELL = StationConfig(
-    robot=RobotConfig(),
+    robot=RobotConfig(model="UR10"),
     camera=CameraConfig(
         driver="rendered",
         model=CameraModel(1280, 1024, ((1400.0, 0.0, 640.0), (0.0, 1400.0, 512.0), (0.0, 0.0, 1.0))),

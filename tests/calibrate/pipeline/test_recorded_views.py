@@ -91,6 +91,37 @@ def test_a_wrong_kinematics_file_is_named(source: Recording, tmp_path: Path, rob
         load_views(open_recording(path))
 
 
+NAMED = b"robot: {driver: posted, model: UR10}"
+UNNAMED = b"robot: {driver: posted}"
+
+
+@pytest.mark.parametrize(
+    ("robot", "cell_file", "model"),
+    [
+        (RobotIdentity("UR10"), UNNAMED, "unknown"),
+        (RobotIdentity("UR10"), b"robot: [", "unknown"),
+        (RobotIdentity("UR10"), b"- robot", "unknown"),
+        (RobotIdentity("UR10"), NAMED, "UR10"),
+        (RobotIdentity("UR10"), None, "UR10"),  # an import, or a program that wrote the recording
+        (RobotIdentity("UR10", "2014301234"), UNNAMED, "UR10"),
+        (RobotIdentity("UR10", controller_version="3.5.3"), UNNAMED, "UR10"),
+        (RobotIdentity("xArm 6"), UNNAMED, "xArm 6"),
+    ],
+)
+def test_a_default_of_before_is_nobodys_word(
+    source: Recording, tmp_path: Path, robot: RobotIdentity, cell_file: bytes | None, model: str
+) -> None:
+    """Until the default was `unknown`, an arm that nobody had named was recorded as a UR10."""
+    with RecordingWriter(tmp_path / "a.mcap", msgspec.structs.replace(source.info, robot=robot)) as writer:
+        if cell_file is not None:
+            writer.attach("config.yaml", "application/yaml", cell_file)
+        for view, picture in list(source.images())[:3]:
+            writer.image(picture)
+            writer.view(view)
+        path = writer.finish()
+    assert load_views(open_recording(path), fewest=3).views.robot_model == model
+
+
 def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Recording, tmp_path: Path) -> None:
     damaged: dict[int, Damage] = {
         3: lambda data: data[: len(data) // 2],

@@ -144,6 +144,15 @@ async def test_a_cell_plays_the_recorded_poses_and_can_reach_no_hardware(tmp_pat
     assert np.array_equal((await cell.camera.capture()).pixels, image(0)), "the arm stands at the first pose"
 
 
+def test_a_configuration_that_named_no_arm_plays_the_recorded_one(tmp_path: Path) -> None:
+    """Until the default was `unknown`, a recording of a UR10 held a configuration without its model."""
+    unnamed = msgspec.structs.replace(CONFIG, robot=RobotConfig(host="192.168.1.9", serial="R1"))
+    content = msgspec.yaml.encode(unnamed)
+    assert b"model" not in content
+    cell = playback_cell(record(tmp_path / "s.mcap", joints=True, config=content))
+    assert cell.config.robot.model == "UR10"
+
+
 ZEROS = b"camera_guess: {translation_m: [0, 0, 0], rotation_xyzw: [0, 0, 0, 0]}"
 """A quaternion of zeros is no rotation, least of all the identity."""
 

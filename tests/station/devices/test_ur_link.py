@@ -115,6 +115,8 @@ async def test_who_connects_twice_opens_one_link_and_a_closed_one_stays_closed(l
 
 
 async def test_a_robot_that_cannot_be_asked_for_is_named(tmp_path: Path) -> None:
+    with raises("robot-model-not-told"):
+        UrLink(RobotConfig(host="127.0.0.1"))
     with raises("unknown-robot-model"):
         UrLink(RobotConfig(model="UR7", host="127.0.0.1"))
     with raises("no-host"):

@@ -125,6 +125,11 @@ ARM_CLASSES: dict[str, ArmClass] = {
 }
 """Name → class, those with the smallest errors first and what is taken for an unknown arm last."""
 
+CLASSES_HELP = "Class of the arm, by which its own error (1σ per axis) is looked up: " + ", ".join(
+    f"{one.name} ({1e3 * one.shift_m:g} mm, {1e3 * one.turn_rad:g} mrad)" for one in ARM_CLASSES.values()
+)
+"""What `--arm-class` says of itself."""
+
 _NAMES = {
     _SERVO: """
         so 100, so 101, so 102, so arm 100, so arm 101, so arm 102, so arm, koch, mycobot, mecharm,

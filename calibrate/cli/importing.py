@@ -15,7 +15,9 @@ import msgspec
 import typer
 from rich.console import Console
 
+from calibrate.arms.classes import ARM_CLASSES, CLASSES_HELP
 from calibrate.boards.model import typed_board
+from calibrate.errors import require_choice
 from calibrate.imported import Given, believe, is_described
 from calibrate.pipeline.job import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
@@ -81,6 +83,10 @@ def import_command(
     board: Annotated[
         str | None, typer.Option(help="Such as '9x6 25' (mm) or 'charuco 8x6 30 22 DICT_5X5_100'.")
     ] = None,
+    arm_class: Annotated[
+        str | None,
+        typer.Option(help=f"{CLASSES_HELP}. Default: by the model in dataset.yaml.", show_default=False),
+    ] = None,
     image_topic: Annotated[str | None, typer.Option(help="Topic of the images.")] = None,
     pose_topic: Annotated[
         str | None, typer.Option(help="Topic of the flange's poses, instead of frames.")
@@ -112,6 +118,8 @@ def import_command(
     """
     if output is None and not dry_run:
         raise typer.BadParameter("name the recording to write with -o, or ask with --dry-run")
+    if arm_class is not None:
+        require_choice("--arm-class", arm_class, ARM_CLASSES)
     target = None if dry_run else output
     console = plain_console(stderr=True)
     shown = console.is_terminal and not as_json
@@ -122,13 +130,15 @@ def import_command(
         try:
             with showing() as progress:
                 if is_described(source, dataset, *vars(reading).values()):
-                    done = import_folder(source, target, progress)
+                    done = import_folder(source, target, progress, arm_class=arm_class)
                 elif _is_folder_of_anyone(source):
-                    done = _import_found(source, target, dataset, output, reading, progress)
+                    done = _import_found(source, target, dataset, output, reading, arm_class, progress)
                 else:
                     wanted = Wanted(image_topic, pose_topic, base, flange, joint_topic)
                     limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
-                    done = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
+                    done = import_bag(
+                        source, target, dataset, wanted, limits, pair_within, progress, arm_class
+                    )
         except SeveralReadingsError as problem:
             if as_json or not sys.stdin.isatty():
                 raise
@@ -206,13 +216,14 @@ def _import_found(
     description: Path | None,
     output: Path | None,
     reading: _Reading,
+    arm_class: str | None,
     progress: Progress,
 ) -> Imported:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
     held = look(source, reading.poses)
     told = read_dataset(description)[0] if description else _told(held.root, output)
     believed = believe(held, reading.given(), told, progress)
-    dataset = believed.dataset
+    dataset = believed.dataset.with_arm_class(arm_class)
     content = msgspec.yaml.encode(dataset)
     done = write_views(held.root, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
     if target is not None and dataset != told:

@@ -12,6 +12,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from calibrate.arms.classes import CLASSES_HELP
 from calibrate.cli.contracts import CompareJson, SolveJson
 from calibrate.cli.inputs import read_board, read_camera, read_limits
 from calibrate.cli.output import (
@@ -81,6 +82,10 @@ def solve(
     robot_accuracy_deg: Annotated[
         float | None, typer.Option(min=0.0, help="The same of its orientation (1 mrad a mm)")
     ] = None,
+    arm_class: Annotated[
+        str | None,
+        typer.Option(help=f"{CLASSES_HELP}. Default: as recorded, else by the model", show_default=False),
+    ] = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
@@ -104,6 +109,7 @@ def solve(
         working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
         robot_accuracy_m=None if robot_accuracy_mm is None else robot_accuracy_mm / 1000,
         robot_accuracy_rad=None if robot_accuracy_deg is None else math.radians(robot_accuracy_deg),
+        arm_class=arm_class or "",
     )
     name = Path(os.path.abspath(recording)).name  # noqa: PTH100  (`.` has none, and a link keeps its own)
     target = output or Path(f"{name.removesuffix('.mcap')}.calibration.yaml")

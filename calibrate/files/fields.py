@@ -224,6 +224,7 @@ RECORDS: dict[str, tuple[Field, ...]] = {
         Field("controller_version", TEXT, required=False),
         Field("tcp_offset", Items(NUMBER, 6), required=False),
         Field("payload_kg", NUMBER, required=False),
+        Field("arm_class", TEXT, required=False),
     ),
     "CameraIdentity": (
         Field("vendor", TEXT, required=False),

@@ -12,6 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from calibrate.arms.classes import ARM_CLASSES
 from calibrate.errors import require_choice, require_positive
 from calibrate.handeye.arm_table import CorrectedArm
 from calibrate.handeye.metrics import Observability
@@ -66,9 +67,13 @@ class SolveOptions:
     """1σ per axis of an error of the flange that all views share; counts where the arm is not modelled."""
     robot_accuracy_rad: float | None = None
     """The same of its orientation; None: 1 mrad for each mm."""
+    arm_class: str = ""
+    """Class of the arm (`arms.classes`) as it was told; empty: it is looked up by model and joints."""
 
     def __post_init__(self) -> None:
         require_choice("profile", self.profile, get_args(Profile))
+        if self.arm_class:
+            require_choice("arm_class", self.arm_class, ARM_CLASSES)
         require_positive(
             working_distance_m=self.working_distance_m,
             robot_accuracy_m=self.robot_accuracy_m or None,

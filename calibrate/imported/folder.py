@@ -64,6 +64,7 @@ from recordings.schema.messages import (
     CameraModel,
     Matrix4,
     Mount,
+    RobotIdentity,
 )
 
 LEAST_GUESSED_TOLERANCE = 0.003
@@ -92,6 +93,8 @@ class Given:
     """Of pairs: the board in the camera, or the camera in the board."""
     camera_axes: CameraAxes | None = None
     """Of pairs: those of the camera in whose frame the board is told."""
+    robot: str | RobotIdentity = ""
+    """The arm as dataset.yaml tells it; empty: nobody told which it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,9 +130,15 @@ def believe(
     """
     board_told = given.board is not None
     if told is not None:
+        told = _without_folders_name(told)
         if told.poses is not None and given == Given() and held.told is None:
             return _as_before(cameras_apart(held, held.tables), told, told.poses)
-        given = replace(given, mount=given.mount or told.mount, board=given.board or told.board)
+        given = replace(
+            given,
+            mount=given.mount or told.mount,
+            board=given.board or told.board,
+            robot=given.robot or told.robot,
+        )
     robots = _robots(held)
     held = cameras_apart(held, robots)
     sets = image_sets(held, robots, given.images)
@@ -358,6 +367,13 @@ def _sizes(paths: list[Path]) -> str | None:
     return ", ".join(f"{len(each)} of {w}×{h} ({each[0].name})" for (w, h), each in ranked)
 
 
+def _without_folders_name(told: Dataset) -> Dataset:
+    """Earlier versions wrote the folder's name for a robot that nobody had named."""
+    if told.poses is None or told.robot != Path(told.poses.source).name:
+        return told
+    return msgspec.structs.replace(told, robot="")
+
+
 def _as_before(held: Contents, told: Dataset, poses: PosesTold) -> Believed:
     tables = {table.name: table for table in held.tables}
     table, board = tables.get(poses.table), tables.get(poses.images) if poses.board_convention else None
@@ -434,7 +450,7 @@ def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
         str(held.root.resolve()),
         axes,
     )
-    dataset = Dataset(mount, board, camera, held.root.resolve().name, poses=told)
+    dataset = Dataset(mount, board, camera, given.robot, poses=told)
     used = {best.table.files, saw[0].files if saw else best.family, *([joints.files] if joints else [])}
     describes = seen.camera_known or (seen.square_known and not saw)
     unused = _unused(held, used | (held.described_by if describes else set()))

@@ -18,6 +18,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from calibrate.arms.classes import ARM_CLASSES
 from calibrate.boards.model import check_board, has_markers
 from calibrate.errors import BadViewsError, require_choice
 from calibrate.files.calibration import Calibration
@@ -62,6 +63,8 @@ class JobOptions:
     robot_accuracy_m: float | None = None
     """1σ per axis of an error of the flange that all views share, for an arm that nothing else describes."""
     robot_accuracy_rad: float | None = None
+    arm_class: str = ""
+    """Class of the arm (`arms.classes`), instead of the recorded one or of looking it up by the model."""
     without: tuple[int, ...] = ()
     """Numbers, from 1, of the poses that a person leaves out."""
     threads: int | None = None
@@ -70,6 +73,8 @@ class JobOptions:
     def __post_init__(self) -> None:
         require_choice("profile", self.profile, get_args(Profile))
         require_choice("lens_model", self.lens_model, get_args(LensModel))
+        if self.arm_class:
+            require_choice("arm_class", self.arm_class, ARM_CLASSES)
 
     @property
     def chosen(self) -> dict[str, Any]:
@@ -166,6 +171,7 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
         working_distance_m=options.working_distance_m,
         robot_accuracy_m=options.robot_accuracy_m,
         robot_accuracy_rad=options.robot_accuracy_rad,
+        arm_class=options.arm_class or prepared.recording.info.robot.arm_class,
     )
 
 

@@ -30,11 +30,13 @@ def import_bag(
     limits: StandstillLimits = StandstillLimits(),  # noqa: B008 - frozen
     pair_within_s: float = PAIR_WITHIN_S,
     progress: Progress = lambda done, total, text: None,
+    arm_class: str | None = None,
 ) -> Imported:
     """`output` None: says what would be taken and writes nothing. Raises ImportSourceError or RecordingError.
 
-    `description`: a dataset.yaml with mount and board (default: the one in or beside the source). The bag is
-    read in a process of its own.
+    `description`: a dataset.yaml with mount and board (default: the one in or beside the source).
+    `arm_class`: the class of the arm, as a person tells it; None: as dataset.yaml tells it.
+    The bag is read in a process of its own.
     """
     views = output is not None
     with read_bag(source, description, wanted, limits, pair_within_s, views, progress) as answers:
@@ -46,7 +48,11 @@ def import_bag(
         session, attached = next(answers, (None, []))
         if not isinstance(session, SessionRead) or len(attached) != 1:
             raise unexpected(source)
-        with derived_recording(output, session.info) as writer:
+        info = session.info
+        if arm_class is not None:
+            robot = msgspec.structs.replace(info.robot, arm_class=arm_class)
+            info = msgspec.structs.replace(info, robot=robot)
+        with derived_recording(output, info) as writer:
             writer.attach(DATASET_FILE, "application/yaml", attached[0])
             writer.attach("import.json", "application/json", msgspec.json.encode(bag.facts))
             _write(writer, source, answers, bag.stops, progress)

@@ -75,18 +75,30 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     note: str = ""
     poses: PosesTold | None = None
 
+    @property
+    def robot_identity(self) -> RobotIdentity:
+        """What is told of the robot; its model alone, where it is written as a name."""
+        robot = self.robot
+        return RobotIdentity(model=robot or "unknown") if isinstance(robot, str) else robot
+
+    def with_arm_class(self, arm_class: str | None) -> Dataset:
+        """Tell the class of the arm, too; None: what is told of it stays."""
+        if arm_class is None:
+            return self
+        robot = msgspec.structs.replace(self.robot_identity, arm_class=arm_class)
+        return msgspec.structs.replace(self, robot=robot)
+
     def session(self, source: Path, camera: CameraModel, created_ns: int = 0, note: str = "") -> SessionInfo:
         """Description of a recording made from `source`; `note` where dataset.yaml has none."""
         from importlib.metadata import version  # a reader's process need not wait for it
 
-        robot = self.robot
         return SessionInfo(
             name=session_name_from(source.resolve().name if source.is_dir() else source.stem),
             mount=self.mount,
             source="imported",
             board=self.board,
             camera=camera,
-            robot=RobotIdentity(model=robot or "unknown") if isinstance(robot, str) else robot,
+            robot=self.robot_identity,
             camera_identity=CameraIdentity(driver="imported"),
             created_wall_ns=created_ns or time.time_ns(),
             software={"calibration-station": version("calibration-station")},

@@ -39,15 +39,18 @@ def import_folder(
     output: Path | None,
     progress: Progress = lambda done, total, text: None,
     newest: int | None = None,
+    arm_class: str | None = None,
 ) -> Imported:
     """Reads `dataset.yaml`, `poses.csv` and the images, writes `output` (.mcap), which must not exist.
 
     `output` None: checks everything and writes nothing. `newest`: only the last so many rows; None: all.
+    `arm_class`: the class of the arm, as a person tells it; None: as dataset.yaml tells it.
     PNG and JPEG files keep their bytes. Everything is checked before the file is begun, and nothing is left
     behind when an image turns out bad. Raises ImportSourceError or RecordingError.
     """
     read = reader.read_described(folder, newest)
-    return _write(folder, output, read.dataset, read.rows, read.beside, read.newest_ns, progress)
+    dataset = read.dataset.with_arm_class(arm_class)
+    return _write(folder, output, dataset, read.rows, read.beside, read.newest_ns, progress)
 
 
 def write_views(

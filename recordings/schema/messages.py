@@ -105,6 +105,8 @@ class RobotIdentity(_Device, frozen=True, forbid_unknown_fields=True, omit_defau
     tcp_offset: Vector6 = (0.0,) * 6
     """flange_from_tcp as on the pendant: x y z [m], rotation vector [rad]. Kept beside, never mixed in."""
     payload_kg: float = 0.0
+    arm_class: str = ""
+    """Class of arms as a person told it, by which its error is looked up; empty: by the model."""
 
 
 CELL_FILE_NAME = "config.yaml"

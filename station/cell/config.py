@@ -85,6 +85,9 @@ class RobotConfig(Section, frozen=True):
     """ur: a Universal Robots arm. posted: any arm, moved by a person, whose pose a program posts."""
     model: str = UNKNOWN_ARM
     """Model of the arm, as its controller tells it; of a posted one, its name"""
+    arm_class: str = ""
+    """Class of arms, for its own error where joints do not tell it; empty: by the model. universal-robots,
+    industrial-six, seven-joints, servo or unknown"""
     host: str = ""
     serial: str = ""
     """Serial number; when given, other arms are refused."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibrate.arms.classes import ARM_CLASSES
 from calibrate.arms.kinematics import MODELS, forward
 from calibrate.boards.model import BoardError, check_board
 from recordings import strict_yaml
@@ -96,6 +97,9 @@ def _contradictions(config: StationConfig) -> Iterator[Problem]:
     elif not _is_calibrated(robot):
         text = f"moves the flange by more than {_MOST_CORRECTION} m, or turns it by more than as many radians"
         yield "robot.kinematics", text, "Give the corrections of this arm, in metres and radians."
+    if robot.arm_class and robot.arm_class not in ARM_CLASSES:
+        text = f"'{robot.arm_class}' is no class of arms"
+        yield "robot.arm_class", text, f"Give one of {', '.join(ARM_CLASSES)}."
     if not robot.host and robot.driver == "ur":
         remedy = "Read it on the pendant: menu (top right) → About, or Settings → System → Network."
         yield "robot.host", "the controller's address is missing", remedy

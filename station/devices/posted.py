@@ -72,7 +72,8 @@ class PostedArm:
     """`source`: the cell's. `control`: path of its control socket."""
 
     def __init__(self, config: StationConfig, source: Source, control: Path) -> None:
-        self.identity = RobotIdentity(model=config.robot.model, serial=config.robot.serial)
+        robot = config.robot
+        self.identity = RobotIdentity(robot.model, robot.serial, arm_class=robot.arm_class)
         self.guided = False
         self.notice = ""
         self.kinematics: ArmKinematics | None = None

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import yaml
 
+from calibrate.arms.classes import ARM_CLASSES, arm_class
 from calibrate.boards.model import board_points
 from calibrate.views.view_set import board_in_camera
 from recordings.files import ASKED_FOR, read_file, write_atomically
@@ -198,6 +199,9 @@ def config_text(config: StationConfig) -> str:
         "board_guess": f"{parents[1]}_from_board, from the guided views, 1 sigma below",
         "board": _COUNTED[config.board.kind],
     }
+    if config.robot.driver == "posted":
+        taken_for = arm_class(config.robot.model, config.robot.arm_class)
+        notes["robot"] = f"taken for {taken_for.title}; arm_class tells another: {', '.join(ARM_CLASSES)}"
     text = yaml.dump(plain, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=200)
     lines = [
         f"{line}   # {notes[key]}" if (key := line.partition(":")[0].strip()) in notes else line

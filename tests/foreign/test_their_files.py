@@ -128,8 +128,9 @@ def test_states_hold_the_tool_that_is_told_and_the_time_of_the_images(tmp_path: 
     offset = (0.0, 0.0, 0.2, 0.1, 0.0, 0.0)
     told = tmp_path / "told.yaml"
     told.write_text(f"{DESCRIPTION}robot: {{model: UR10, tcp_offset: {list(offset)}}}\n")
-    import_bag(ros(tmp_path), tmp_path / "out.mcap", told)
+    import_bag(ros(tmp_path), tmp_path / "out.mcap", told, arm_class="servo")
     recording = open_recording(tmp_path / "out.mcap")
+    assert (recording.info.robot.model, recording.info.robot.arm_class) == ("UR10", "servo")
     samples, view = recording.robot_samples(), recording.views()[2]
     state = np.searchsorted(samples.stamps_ns, view.stamps.host_monotonic_ns)
     flange = base_from_flange(tuple(samples.tcp_pose[state].tolist()), offset)

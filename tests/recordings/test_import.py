@@ -52,6 +52,8 @@ def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None
         np.testing.assert_array_equal(picture.pixels, make_image(view.index))
     assert set(recording.attachments()) == {"dataset.yaml", "poses.csv", "kinematics.yaml"}
     assert done.images == 3
+    told = open_recording(import_folder(folder, tmp_path / "told.mcap", arm_class="servo").path).info.robot
+    assert (told.model, told.arm_class, info.robot.arm_class) == ("UR10", "servo", "")
     again = import_folder(folder, tmp_path / "again.mcap").path
     assert open_recording(again).sha256 == recording.sha256, "no new views for a drift check"
     (folder / "images/0.png").unlink()  # of a folder that grows, old pictures may be gone

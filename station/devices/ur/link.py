@@ -135,6 +135,7 @@ class UrLink:
             controller_version=self.states.version,
             tcp_offset=self.tool.offset,
             payload_kg=self.tool.payload[0],
+            arm_class=self.config.arm_class,
         )
 
     def _check_identity(self, found: Found) -> None:

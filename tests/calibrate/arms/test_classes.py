@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -113,3 +114,10 @@ def test_classes_go_from_the_best_to_the_worst() -> None:
     sizes = [one.shift_m for one in ARM_CLASSES.values() if one.name != UNKNOWN]
     assert sizes == sorted(sizes)
     assert list(ARM_CLASSES)[-1] == UNKNOWN
+
+
+@pytest.mark.parametrize("one", ARM_CLASSES.values(), ids=list(ARM_CLASSES))
+def test_the_page_states_the_figures_that_are_used(one) -> None:
+    page = Path(__file__).parents[3] / "docs/integrator/any-arm.md"
+    figures = f"| `{one.name}` | {1e3 * one.shift_m:g} mm | {1e3 * one.turn_rad:g} mrad |"
+    assert figures in page.read_text()

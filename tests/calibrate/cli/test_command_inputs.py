@@ -51,6 +51,7 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
         ("--camera", "camera.yaml", "input-file", "camera_info"),
         ("--square-mm", "-4", "board-impossible", "square_m"),
         ("--profile", "nix", "", "robust"),
+        ("--arm-class", "cheap", "choice", "universal-robots", "servo"),
     ):
         refused(run("solve", session_file, option, value, cwd=tmp_path), 2, code, *named)
     assert (tmp_path / "precious.yaml").read_text() == files["precious.yaml"]

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from benchmarks.misread_poses import MISREAD, said
-from calibrate.arms.kinematics import MODELS
 from calibrate.files import exports
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
@@ -28,7 +27,7 @@ from recordings.errors import SeveralReadingsError
 from recordings.importers.conventions import possible
 from recordings.importers.tables import look
 from recordings.reader import open_recording
-from recordings.schema.messages import BoardKind, BoardSpec, Mount
+from recordings.schema.messages import BoardKind, BoardSpec, Mount, RobotIdentity
 from tests.calibrate.chains import arm_cell
 from tests.calibrate.pose_files import (
     HOLDERS,
@@ -250,7 +249,7 @@ def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_pa
     assert call(main, "import", folder, "-o", out).returncode == 0
     assert open_recording(out).views() == first.views()
     assert first.info.mount == "eye-in-hand"
-    assert first.info.robot.model not in MODELS
+    assert first.info.robot == RobotIdentity(), "a folder's name is nobody's word on the arm"
     out.unlink()
     other = shutil.copytree(folder, tmp_path / "other")
     assert call(main, "import", other, "-o", out).returncode == 1, "what is believed of one holds of no other"
@@ -259,6 +258,19 @@ def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_pa
     out.unlink()
     assert call(main, "import", folder, "-o", out).returncode == 0
     assert open_recording(out).info.mount == "eye-to-hand"
+
+
+def test_who_the_arm_is_is_kept_as_it_was_told(put: Callable[..., Path], tmp_path: Path) -> None:
+    folder, out = put(kuka), tmp_path / "mine.mcap"
+    told = call(main, "import", folder, "-o", out, "--mount", "eye-in-hand", "--arm-class", "seven-joints")
+    assert told.returncode == 0, told.stderr
+    assert open_recording(out).info.robot == RobotIdentity(arm_class="seven-joints")
+    out.unlink()
+    assert call(main, "import", folder, "-o", out).returncode == 0
+    assert open_recording(out).info.robot.arm_class == "seven-joints"
+    wrong = call(main, "import", folder, "--dry-run", "--arm-class", "cheap", "--json")
+    assert wrong.returncode == 2
+    assert "industrial-six" in wrong.stderr
 
 
 def test_a_described_folder_takes_no_options(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import yaml
 
-from calibrate.errors import BadViewsError
+from calibrate.errors import BadViewsError, UsageError
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
-from calibrate.handeye.solution import Reading
+from calibrate.handeye.solution import Reading, SolveOptions
 from calibrate.pipeline.job import (
     JobOptions,
     SolvedRecording,
@@ -29,7 +29,7 @@ from calibrate.views.corners import MAIN_BOARD
 from calibrate.views.view_set import ViewSet
 from recordings.geometry import difference
 from recordings.importers.folder import import_folder
-from recordings.schema.messages import CameraIdentity, CameraModel
+from recordings.schema.messages import CameraIdentity, CameraModel, RobotIdentity
 from tests.calibrate.cells import error_mm_deg, inside
 from tests.calibrate.sessions import CAMERA, SYMMETRIC_BOARD, X_TRUE, Scene, write_session
 from tests.codes import raises
@@ -98,6 +98,32 @@ def test_a_number_held_fixed_leaves_the_others_their_stated_error(real_session_f
     sigma = solver_options(options, prepare_views(real_session_file, options)).lens_sigma
     assert sigma is not None and sigma[:2] == (17.0, 16.0) and sigma[4] == 0.3
     assert 0 < sigma[8] < 1e-6 and sigma[2] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("recorded", "told", "used"),
+    [
+        ("", "", ""),
+        ("servo", "", "servo"),
+        ("", "servo", "servo"),
+        ("servo", "industrial-six", "industrial-six"),
+    ],
+)
+def test_the_class_of_the_arm_is_what_was_told_last(
+    tmp_path: Path, recorded: str, told: str, used: str
+) -> None:
+    robot = RobotIdentity("xArm 6", arm_class=recorded)
+    path = write_session(tmp_path / "a.mcap", Scene(views=6), known_lens=True, robot=robot)
+    options = JobOptions(arm_class=told)
+    assert solver_options(options, prepare_views(path, options)).arm_class == used
+    assert options.chosen.get("arm_class", "") == told
+
+
+def test_a_class_of_arms_that_does_not_exist_is_refused() -> None:
+    with raises("choice", UsageError):
+        JobOptions(arm_class="cheap")
+    with raises("choice", UsageError):
+        SolveOptions(arm_class="cheap")
 
 
 def test_a_lens_of_another_camera_never_passes(real_session_file: Path) -> None:

@@ -52,6 +52,7 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
         ("speed_m_s: 0.2", "speed_m_s: 0.3", "speed_m_s: Expected `float` <= 0.25"),
         ("model: UR10", "model: UR11", "UR10e"),
         ("model: UR10, ", "", "Write the model that the pendant shows"),
+        ("model: UR10", "model: UR10, arm_class: cheap", "industrial-six, seven-joints, servo"),
         ("model: UR10", "model: unknown", "Write the model that the pendant shows"),
         ("normal: [0, 0, 1]", "normal: [0, 0, 0]", "'table' is zero"),
         ("device: KJ001", "device: KJ001, trigger: hardware", "section 'trigger'"),

@@ -73,7 +73,9 @@ class Poster:
 
 
 def config(tcp_port: int | None = None, **still: float) -> Any:
-    robot = RobotConfig(driver="posted", model="arm of three words", serial="A1", tcp_port=tcp_port)
+    robot = RobotConfig(
+        driver="posted", model="arm of three words", arm_class="servo", serial="A1", tcp_port=tcp_port
+    )
     limits = StillnessConfig(**still)
     return msgspec.structs.replace(memory_config(), robot=robot, stillness=limits)
 
@@ -121,7 +123,8 @@ async def test_a_posted_arm_is_there_with_its_first_pose_and_its_states_carry_po
     poster.post(exact.tolist())
     poster.post([*POSE[:3], *(-x for x in POSE[3:])])  # the same rotation
     await until(lambda: len(states) == 3)
-    assert (await arm.connect()).model == "arm of three words"
+    identity = await arm.connect()
+    assert (identity.model, identity.arm_class) == ("arm of three words", "servo")
     for state in states:
         assert np.abs(base_from_flange(state.tcp_pose, arm.identity.tcp_offset) - exact).max() < 1e-14
     assert [len(state.joints_rad) for state in states] == [7, 0, 0]

@@ -15,12 +15,13 @@ do it), is the figure published for the class: `published_mm`, from `source`.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from benchmarks.judge.frames import Array, inverse, pose, rotation, rotation_vector, small_motion, unit
+from benchmarks.judge.frames import Array, Flags, inverse, pose, rotation, rotation_vector, small_motion, unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +93,7 @@ def from_axes(points: list[list[float]], directions: list[list[float]], flange: 
         x = unit(np.cross(np.eye(3)[np.argmin(np.abs(z))], z))
         frames.append(pose(np.column_stack([x, np.cross(z, x), z]), point))
     frames.append(flange)
-    return Chain(np.array([inverse(a) @ b for a, b in zip(frames[:-1], frames[1:], strict=True)]))
+    return Chain(np.array([inverse(a) @ b for a, b in itertools.pairwise(frames)]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +172,7 @@ def registered(points: Array, onto: Array) -> Array:
     return np.asarray((points - middle) @ U @ turn @ Vt + target)
 
 
-def solve_joints(arm: ArmClass, targets: Array, start: Array, rounds: int = 40) -> tuple[Array, Array]:
+def solve_joints(arm: ArmClass, targets: Array, start: Array, rounds: int = 40) -> tuple[Array, Flags]:
     """Joints (m, n) that bring the table's flange to `targets` (m, 4, 4), and which of them do so (m,).
 
     Damped least squares from `start` (n,) or (m, n) (C. W. Wampler, 1986); limits are kept or it fails.

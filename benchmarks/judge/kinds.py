@@ -130,9 +130,9 @@ UNSEEN = (
 EVERY = {kind.name: kind for kind in (*KINDS, *UNSEEN)}
 
 _SIZES = (
-    "sag", "backlash", "eccentric", "remastered", "creep", "growth", "base_drift_mm", "slip_mrad", "loose_mrad",
-    "told_mm", "told_joint_deg", "noise_mm", "aspect", "given_error", "breathing_mm", "focal_drift", "bump_mm",
-    "rolling_mm", "dirt_px", "print_x", "print_y", "bend_mm",
+    "sag", "backlash", "eccentric", "remastered", "creep", "growth", "base_drift_mm", "slip_mrad",
+    "loose_mrad", "told_mm", "told_joint_deg", "noise_mm", "aspect", "given_error", "breathing_mm",
+    "focal_drift", "bump_mm", "rolling_mm", "dirt_px", "print_x", "print_y", "bend_mm",
 )  # fmt: skip
 """What another draw scales. The rest is drawn by its own rule below."""
 

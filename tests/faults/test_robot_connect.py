@@ -40,6 +40,15 @@ def robot_at(host: str, folder: Path, model: str = "UR10", **config: Any) -> UrR
     return UrRobot(RobotConfig(model=model, host=host, **config), folder / "log")
 
 
+async def test_a_class_that_the_cell_file_tells_is_of_the_arms_identity(
+    arm: SimulatedController, tmp_path: Path
+) -> None:
+    robot = robot_at(arm.host, tmp_path, arm_class="industrial-six")
+    identity = await robot.link.connect()
+    await robot.link.close()
+    assert (identity.model, identity.arm_class) == ("UR10", "industrial-six")
+
+
 def complaint(robot: UrRobot) -> ErrorData | None:
     try:
         robot.link.check(robot.link.state())

@@ -182,6 +182,7 @@ async def test_an_arm_that_a_program_posts_needs_a_name_a_camera_and_a_board(tmp
     assert app.return_value == "serve"
     config, _ = load_config(tmp_path / "station.yaml")
     assert (config.robot.driver, config.robot.model, config.board.columns) == ("posted", "xArm 6", 9)
+    assert "an industrial arm of six joints" in (tmp_path / "station.yaml").read_text()
 
 
 async def test_a_camera_plugged_in_later_is_found_and_shown_before_it_is_taken(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from calibrate.report.page import report_page
 from recordings.cli import main
 from recordings.errors import SeveralReadingsError
 from recordings.importers.conventions import possible
+from recordings.importers.dataset import read_dataset
 from recordings.importers.tables import look
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, Mount, RobotIdentity
@@ -268,6 +269,12 @@ def test_who_the_arm_is_is_kept_as_it_was_told(put: Callable[..., Path], tmp_pat
     out.unlink()
     assert call(main, "import", folder, "-o", out).returncode == 0
     assert open_recording(out).info.robot.arm_class == "seven-joints"
+    beside = out.with_suffix(".dataset.yaml")  # as earlier versions wrote it
+    kept = msgspec.structs.replace(read_dataset(beside)[0], robot=folder.name)
+    beside.write_bytes(msgspec.yaml.encode(kept))
+    out.unlink()
+    assert call(main, "import", folder, "-o", out).returncode == 0
+    assert open_recording(out).info.robot == RobotIdentity()
     wrong = call(main, "import", folder, "--dry-run", "--arm-class", "cheap", "--json")
     assert wrong.returncode == 2
     assert "industrial-six" in wrong.stderr

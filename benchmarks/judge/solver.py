@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from benchmarks.judge.cell import Cell
+from benchmarks.judge.cell import COLUMNS, ROWS, Cell
 from benchmarks.judge.frames import Array
 from benchmarks.judge.lenses import Lens
 from calibrate.errors import CalibrationError
@@ -22,8 +22,13 @@ from calibrate.views.projection import intrinsics_names
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 
-_BOARD_COLUMNS = 9
-_BOARD_ROWS = 7
+_CLASSES = {
+    "UR": "universal-robots",
+    "industrial six": "industrial-six",
+    "seven joints": "seven-joints",
+    "servo arm": "servo",
+}
+"""The judge's class of arms → what a user tells the product."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +84,17 @@ class Answer:
 
 
 def answer(cell: Cell) -> Answer:
-    """Solve and judge a cell as the product's own command line would."""
-    return _answer(cell, SolveOptions())
+    """Solve and judge a cell as the product's own command line would, with the class of the arm told."""
+    return _answer(cell, SolveOptions(arm_class=_CLASSES[cell.name.arm]))
 
 
 def answer_with_arm_told(cell: Cell, accuracy_m: float, accuracy_rad: float) -> Answer:
     """The same where the product is told the size of that arm's errors: 1σ per axis of the flange."""
-    told = SolveOptions(robot_accuracy_m=max(accuracy_m, 1e-6), robot_accuracy_rad=max(accuracy_rad, 1e-6))
+    told = SolveOptions(
+        arm_class=_CLASSES[cell.name.arm],
+        robot_accuracy_m=max(accuracy_m, 1e-6),
+        robot_accuracy_rad=max(accuracy_rad, 1e-6),
+    )
     return _answer(cell, told)
 
 
@@ -164,15 +173,13 @@ def _views(cell: Cell) -> ViewSet:
     views = ViewSet(mount, seen, camera, _told_arm(cell))
     if cell.given is None:
         views = replace(views, camera=calibrate_intrinsics(views, "plumb_bob").camera)
-    board = BoardSpec(BoardKind.CHESSBOARD, _BOARD_COLUMNS, _BOARD_ROWS, cell.board_m)
+    board = BoardSpec(BoardKind.CHESSBOARD, COLUMNS, ROWS, cell.board_m)
     return solve_pnp(views, board)
 
 
 def _told_arm(cell: Cell) -> str:
-    """The arm's model as a user would write it. With no joints it is a stranger's: no table is looked up.
-
-    A class that the product knows by name is to be told here.
-    """
+    """The arm's model as a user would write it. Without joints only its class is told (`_CLASSES`), lest the
+    product finds the joints by a table that it knows."""
     model = cell.world.arm.model
     return model if cell.name.joints and model.startswith("UR") else "unknown"
 

@@ -215,10 +215,10 @@ def test_what_was_recorded_shows_the_board_where_the_truth_has_it(mount: str) ->
 @pytest.mark.parametrize("kind", EVERY)
 def test_every_kind_makes_a_cell_that_differs_from_a_clean_one(kind: str) -> None:
     cell = make(Name(kind, "UR", "eye-in-hand", True, 0, 0))
-    again = make(Name(kind, "UR", "eye-in-hand", False, 0, 0))
+    again = make(Name(kind, "UR", "eye-in-hand", False, 0, 0, told=False))
     assert len(cell.views) == EVERY[kind].views
     for view, same in zip(cell.views, again.views, strict=True):
-        assert np.array_equal(view.pixels, same.pixels), "the same recording with joints and without"
+        assert np.array_equal(view.pixels, same.pixels), "the same recording whatever is told of it"
     other = make(Name(kind, "UR", "eye-in-hand", True, 1, 0))
     assert len(other.views) != len(cell.views) or not np.array_equal(other.told, cell.told)
     plain = replace(EVERY[kind], **{k: v for k, v in vars(Kind("")).items() if k not in {"name"}})
@@ -300,6 +300,27 @@ def test_tables_tell_ratios_of_each_cell_and_who_was_refused() -> None:
     price = [cells for cells in lines if cells[:1] == ["in hand, joints"]][3]
     assert price[2] == "2.00"
     assert ["bump", "1", "0", "100", "camera-moved 1"] in lines
+
+
+def test_tables_tell_the_parts_and_the_stated_distance_where_the_solver_states_them() -> None:
+    parts = {"from_x": 0.2, "from_arm": 0.5, "floor": 0.1}
+    row = Row(
+        "clean", "UR", "eye-to-hand", False, 0, 0, stated=0.6, stated_p95=1.1, stated_parts=parts,
+        stated_arm="assumed", rms=0.5, within_p95=0.96,
+    )  # fmt: skip
+    lines = [[cell.strip() for cell in text.split("|")[1:-1]] for text in tables([row]).splitlines()]
+    assert ["fixed, none", "1", "96.0"] in lines
+    assert ["cells", "floor mm", "from_arm mm", "from_x mm", "arm"] in lines
+    assert ["fixed, none", "0.1", "0.5", "0.2", "assumed 1"] in lines
+    assert tables([]).startswith("0 cells")
+
+
+def test_a_file_of_rows_is_read_as_it_was_written(tmp_path: Path) -> None:
+    row = Row("clean", "UR", "eye-to-hand", False, 3, 1, told=False, closed=("weight",), stated=0.6)
+    out = tmp_path / "rows.jsonl"
+    out.write_text(line(row) + "\n")
+    assert read(out) == [row]
+    assert read(tmp_path / "none.jsonl") == []
 
 
 @pytest.mark.process

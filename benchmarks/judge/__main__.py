@@ -30,9 +30,9 @@ def main() -> int:
     asked = _asked()
     kinds = [kind for given in asked.kinds for kind in _GROUPS.get(given, [given])]
     if not asked.table:
-        wanted = list(names(kinds, asked.draw or [0], asked.cells, asked.seed))
+        wanted = list(names(kinds, asked.draw or [0], asked.cells, asked.seed, not asked.untold))
         run(asked.out, wanted, asked.price, asked.workers)
-    rows = [row for row in read(asked.out) if row.kind in kinds]
+    rows = [row for row in read(asked.out) if row.kind in kinds and row.told != asked.untold]
     if asked.draw:
         rows = [row for row in rows if row.draw in asked.draw]
     print(tables(rows))
@@ -56,6 +56,7 @@ def _asked() -> argparse.Namespace:
     )
     parser.add_argument("--draw", type=int, nargs="+", help="numbers that draw seeds and sizes; 0: as tabled")
     parser.add_argument("--seed", type=int, default=0, help="of the first cells")
+    parser.add_argument("--untold", action="store_true", help="the arm's class is not told")
     parser.add_argument("--price", type=float, default=0.2, help="share of cells solved with the arm told")
     parser.add_argument("--workers", type=int, default=2, help="processes, each with one thread")
     parser.add_argument("--table", action="store_true", help="only print the tables of --out")

@@ -57,10 +57,12 @@ class Name:
     """The joints were recorded, too."""
     draw: int
     seed: int
+    told: bool = True
+    """The arm's class is told; else it is an unknown arm."""
 
     @property
     def numbers(self) -> list[int]:
-        """Seeds of the cell. `joints` is none: with joints and without them it is the same recording."""
+        """Seeds of the cell. `joints` and `told` are none: it is the same recording with and without."""
         return [self.draw, self.seed, *f"{self.kind}/{self.arm}/{self.mount}".encode()]
 
 

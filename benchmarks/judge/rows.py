@@ -36,6 +36,8 @@ class Row:
     joints: bool
     draw: int
     seed: int
+    told: bool = True
+    """The arm's class was told."""
     form: int = FORM
     refused: str = ""
     """Code of the refusal, `no-cell` where the generator found none; empty where there was an answer."""
@@ -83,7 +85,7 @@ class Row:
     @property
     def key(self) -> tuple[object, ...]:
         """The cell's name."""
-        return self.kind, self.arm, self.mount, self.joints, self.draw, self.seed
+        return self.kind, self.arm, self.mount, self.joints, self.draw, self.seed, self.told
 
 
 def measure(name: Name, price: bool) -> Row:
@@ -91,7 +93,7 @@ def measure(name: Name, price: bool) -> Row:
 
     price: have it solved once more by the solver that is told the size of this arm's errors.
     """
-    whose = (name.kind, name.arm, name.mount, name.joints, name.draw, name.seed)
+    whose = (name.kind, name.arm, name.mount, name.joints, name.draw, name.seed, name.told)
     try:
         cell = make(name)
     except NoCellError:
@@ -140,7 +142,9 @@ def measure(name: Name, price: bool) -> Row:
     )
 
 
-def names(kinds: list[str], draws: list[int], count: int, first_seed: int = 0) -> Iterator[Name]:
+def names(
+    kinds: list[str], draws: list[int], count: int, first_seed: int = 0, told: bool = True
+) -> Iterator[Name]:
     """The first `count` names: every kind in turn, so that any number of cells covers them evenly.
 
     Class, mount and joints go through their sixteen combinations, another one for each kind; then the next
@@ -157,7 +161,7 @@ def names(kinds: list[str], draws: list[int], count: int, first_seed: int = 0) -
         turn, place = divmod(i, len(kinds))
         seed, part = divmod(turn, len(combinations))
         arm, mount, joints, draw = combinations[(part + 5 * place) % len(combinations)]
-        yield Name(kinds[place], arm, mount, joints, draw, first_seed + seed)
+        yield Name(kinds[place], arm, mount, joints, draw, first_seed + seed, told)
 
 
 def read(path: Path) -> list[Row]:
@@ -176,6 +180,11 @@ def read(path: Path) -> list[Row]:
         told["closed"] = tuple(told["closed"])
         rows.append(Row(**{name: value for name, value in told.items() if name in known}))
     return rows
+
+
+def key(name: Name) -> tuple[object, ...]:
+    """As `Row.key`."""
+    return name.kind, name.arm, name.mount, name.joints, name.draw, name.seed, name.told
 
 
 def line(row: Row) -> str:

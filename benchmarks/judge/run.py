@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TextIO
 
 from benchmarks.judge.cell import Name
-from benchmarks.judge.rows import Row, line, measure, read
+from benchmarks.judge.rows import Row, key, line, measure, read
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _TASKS_A_WORKER = 400
@@ -46,11 +46,6 @@ def run(out: Path, wanted: list[Name], price_share: float, workers: int) -> None
                     file=sys.stderr,
                     flush=True,
                 )
-
-
-def key(name: Name) -> tuple[object, ...]:
-    """As `Row.key`."""
-    return name.kind, name.arm, name.mount, name.joints, name.draw, name.seed
 
 
 def has_price(name: Name, share: float) -> bool:

@@ -84,14 +84,14 @@ class Answer:
 
 
 def answer(cell: Cell) -> Answer:
-    """Solve and judge a cell as the product's own command line would, with the class of the arm told."""
-    return _answer(cell, SolveOptions(arm_class=_CLASSES[cell.name.arm]))
+    """Solve and judge a cell as the product's own command line would."""
+    return _answer(cell, SolveOptions(arm_class=_told_class(cell)))
 
 
 def answer_with_arm_told(cell: Cell, accuracy_m: float, accuracy_rad: float) -> Answer:
     """The same where the product is told the size of that arm's errors: 1σ per axis of the flange."""
     told = SolveOptions(
-        arm_class=_CLASSES[cell.name.arm],
+        arm_class=_told_class(cell),
         robot_accuracy_m=max(accuracy_m, 1e-6),
         robot_accuracy_rad=max(accuracy_rad, 1e-6),
     )
@@ -177,11 +177,16 @@ def _views(cell: Cell) -> ViewSet:
     return solve_pnp(views, board)
 
 
+def _told_class(cell: Cell) -> str:
+    """The class as a user writes it; empty where nobody told it."""
+    return _CLASSES[cell.name.arm] if cell.name.told else ""
+
+
 def _told_arm(cell: Cell) -> str:
-    """The arm's model as a user would write it. Without joints only its class is told (`_CLASSES`), lest the
-    product finds the joints by a table that it knows."""
+    """The arm's model as a user would write it. Without joints at most its class is told, lest the product
+    finds the joints by a table that it knows."""
     model = cell.world.arm.model
-    return model if cell.name.joints and model.startswith("UR") else "unknown"
+    return model if cell.name.told and cell.name.joints and model.startswith("UR") else "unknown"
 
 
 def _camera(lens: Lens) -> CameraModel:

@@ -29,12 +29,14 @@ def tables(rows: list[Row]) -> str:
         ("The same by kind", _points(_grouped(rows, lambda row: row.kind), "kind")),
         ("95 % region of X", _regions(pools)),
         ("Passes: placed point beyond three times what is stated", _wrong_passes(pools)),
+        ("The distance that holds 95 of 100", _p95(pools)),
+        ("Parts of what is stated", _parts(pools)),
         ("Price of honesty", _prices(pools)),
         ("Refusals and verdicts by kind", _verdicts(rows)),
         ("Gates that are closed", _gates(rows)),
         ("CPU of a solve", _cpu(pools)),
     ]
-    parts += [f"## {title}\n{body}" for title, body in sections]
+    parts += [f"## {title}\n{body}" for title, body in sections if body]
     return "\n\n".join(parts)
 
 
@@ -138,6 +140,27 @@ def _beyond(values: list[tuple[float | None, float | None, float | None]]) -> li
         f"{100 * low:.2f} … {100 * high:.2f} %",
         f"{100 * whole[:, 2].mean():.2f}",
     ]
+
+
+def _p95(pools: dict[str, list[Row]]) -> str:
+    lines = []
+    for name, group in pools.items():
+        shares = [row.within_p95 for row in group if row.within_p95 is not None]
+        if shares:
+            lines.append([name, str(len(shares)), f"{100 * np.mean(shares):.1f}"])
+    return _table(["cells", "answers", "points within it %"], lines) if lines else ""
+
+
+def _parts(pools: dict[str, list[Row]]) -> str:
+    """Medians of the parts in millimetres, and where the arm's comes from."""
+    lines = []
+    parts = sorted({part for row in pools["all"] for part in row.stated_parts or {}})
+    for name, group in pools.items():
+        told = [row for row in group if row.stated_parts]
+        arms = Counter(row.stated_arm for row in told)
+        sizes = [_middle([(row.stated_parts or {}).get(part) for row in told]) for part in parts]
+        lines.append([name, *sizes, ", ".join(f"{arm} {count}" for arm, count in arms.most_common())])
+    return _table(["cells", *(f"{part} mm" for part in parts), "arm"], lines) if parts else ""
 
 
 def _prices(pools: dict[str, list[Row]]) -> str:

@@ -230,6 +230,8 @@ def test_another_draw_has_other_sizes_between_a_half_and_twice() -> None:
     for kind in (*KINDS, *UNSEEN):
         assert drawn(kind, 0) == kind
         assert drawn(kind, 7) == drawn(kind, 7)
+        if kind.name != "clean":
+            assert any(drawn(kind, draw) != kind for draw in range(1, 6)), f"{kind.name} has no other size"
         for name in ("sag", "backlash", "eccentric", "creep", "bump_mm", "told_mm", "bend_mm", "growth"):
             size = getattr(kind, name)
             other = getattr(drawn(kind, 7), name)

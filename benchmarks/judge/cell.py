@@ -252,8 +252,12 @@ def rounded(told: Array, step_mm: float) -> Array:
 
 def _lens(kind: Kind) -> Lens:
     lens = LENSES[kind.lens]
-    focal = lens.focal_px
-    return Lens(lens.model, (focal[0], focal[1] * (1.0 + kind.aspect)), lens.centre_px, lens.distortion)
+    fisheye = lens.model == "equidistant"
+    focal_px = lens.focal_px[0] / kind.stronger if fisheye else lens.focal_px[0]
+    distortion = lens.distortion
+    if not fisheye:
+        distortion = tuple(kind.stronger * k for k in distortion)
+    return Lens(lens.model, (focal_px, focal_px * (1.0 + kind.aspect)), lens.centre_px, distortion)
 
 
 def _world(kind: Kind, arm: ArmClass, in_hand: bool, board: Array, rng: np.random.Generator) -> World:

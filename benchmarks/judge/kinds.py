@@ -51,6 +51,8 @@ class Kind:
     # Camera and lens.
     lens: LensModel = "plumb_bob"
     """What the lens is. It is told to be a plumb-bob."""
+    stronger: float = 1.0
+    """By which it bends more than that of `lenses.LENSES`; a fisheye's focal length is shorter by that."""
     aspect: float = 0.0
     """Relative, of the pixels' height against their width."""
     given: bool = False
@@ -152,9 +154,16 @@ def drawn(kind: Kind, draw: int) -> Kind:
     changed = replace(kind, **sizes)  # type: ignore[arg-type]
     occluded = kind.occluded * float(rng.uniform(0.5, 1.2))
     farther = 1.0 + (kind.farther - 1.0) * float(rng.uniform(0.5, 1.3))
+    stronger = 1.0 if kind.lens == "plumb_bob" else float(rng.uniform(0.7, 1.2))
     tilt_deg = kind.tilt_deg if kind.tilt_deg > 10 else kind.tilt_deg * float(rng.uniform(0.5, 2.0))
     clusters = kind.clusters + int(rng.integers(0, 3)) if kind.clusters else 0
     views = kind.views + int(rng.integers(0, kind.more_views + 1))
     return replace(
-        changed, occluded=occluded, farther=farther, tilt_deg=tilt_deg, clusters=clusters, views=views
+        changed,
+        stronger=stronger,
+        occluded=occluded,
+        farther=farther,
+        tilt_deg=tilt_deg,
+        clusters=clusters,
+        views=views,
     )

@@ -16,21 +16,22 @@ from typing import Any, Self
 
 from recordings.plain_text import bytes_text
 
-Value = str | float | int | bool | list[str] | None
+Value = str | float | int | bool | list[str | list[float] | None] | None
+"""One thing, or a list with an entry for each of several: a text, numbers such as x, y, z, or nothing."""
 
 
 def plain_value(value: object) -> Value:
     """Convert a value by its type to one that every message and file can hold.
 
-    A path becomes its text, a NumPy scalar the Python number that it holds, a list one of texts, anything
-    unknown its text.
+    A path becomes its text, a NumPy scalar the Python number that it holds, a list one of texts and of lists
+    of numbers, anything unknown its text.
     """
     if value is None or type(value) in (str, float, int, bool):
         return value  # type: ignore[return-value]  # by the line above
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, list):
-        return [str(each) for each in value]
+        return [_plain_entry(each) for each in value]
     number = getattr(value, "item", None)
     if callable(number) and getattr(value, "ndim", None) == 0:
         return plain_value(number())
@@ -38,6 +39,13 @@ def plain_value(value: object) -> Value:
         if isinstance(value, kind):
             return kind(value)
     return str(value)
+
+
+def _plain_entry(entry: object) -> str | list[float] | None:
+    """Convert an entry of a list."""
+    if isinstance(entry, list) and all(isinstance(each, (int, float)) for each in entry):
+        return [float(number) for number in entry]
+    return None if entry is None else str(entry)
 
 
 @dataclass(frozen=True)  # no msgspec: programs that only use the camera import this
@@ -136,7 +144,7 @@ class _Sentence(Formatter):
 
     def format_field(self, value: Any, form: str) -> str:
         if isinstance(value, list):
-            return "; ".join(value)
+            return "; ".join(map(str, value))
         unit = next((unit for unit in _UNITS if form.endswith(unit)), "")
         try:
             if form == "bytes":
@@ -202,11 +210,6 @@ class StandingReading:
         return " ".join(named)
 
     @property
-    def translation_text(self) -> str:
-        """The translation in mm, as '45.0, -30.0, 65.0'; empty: X does not differ."""
-        return ", ".join(f"{part:.1f}" for part in self.translation_mm or ())
-
-    @property
     def line(self) -> str:
         """All of it in a line."""
         if self.translation_mm is None:
@@ -219,8 +222,8 @@ class SeveralReadingsError(ImportSourceError):
     """More than one way to read the data stands: a person is asked, nothing is guessed.
 
     Values: `source`, `count`, `decides`, and lists with an entry for each reading: `readings` in words,
-    `options` that choose it, as a shell takes them, and `translations_mm` of its X, empty where X does not
-    differ.
+    `options` that choose it, as a shell takes them, and `translations_mm`, x, y and z of its X, None where X
+    does not differ.
     """
 
     code = "several-readings"
@@ -246,7 +249,7 @@ def several_readings(
         decides=decides,
         readings=[each.text for each in readings],
         options=[each.command for each in readings],
-        translations_mm=[each.translation_text for each in readings],
+        translations_mm=[each.translation_mm and [*each.translation_mm] for each in readings],
     )
     error.readings = tuple(readings)
     return error

@@ -79,6 +79,16 @@ class Seen:
     """Its columns and rows are told; else they are as the images show them."""
 
 
+@dataclass(frozen=True)
+class SeldomSeen:
+    """A board that too few images show."""
+
+    board: BoardSpec
+    views: int
+    """Images that show it."""
+    looked: int
+
+
 def told_boards(table: Table) -> Iterator[Seen]:
     """Every reading of a table of board poses as it stands: `pair_readings` tells which way round it is."""
     rows = _spread(len(table.numbers), _MOST_ROWS)
@@ -101,8 +111,10 @@ def _spread(count: int, most: int) -> list[int]:
     return list(map(int, np.linspace(0, count - 1, min(count, most))))
 
 
-def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progress: Progress) -> Seen | None:
-    """Find the board in evenly spread images; None: in too few. ImportSourceError where none can be read."""
+def see_board(
+    held: Contents, given: BoardSpec | None, paths: list[Path], progress: Progress
+) -> Seen | SeldomSeen | None:
+    """Find the board in evenly spread images; None: in none. ImportSourceError where none can be read."""
     images: dict[Path, Grey] = {}
     sizes = set[tuple[int, int]]()
     for path in (paths[place] for place in _spread(len(paths), _VOTERS)):
@@ -129,6 +141,7 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
         likely = _likely(chain(as_told, _shown(greys, told)), few, progress)
         if not any(each.often and (each.known or each.board.kind is BoardKind.CHESSBOARD) for each in likely):
             likely += _likely(_shown_circles(greys), few, progress)
+    seldom: SeldomSeen | None = None
     for each in sorted(likely, key=_Tried.rank)[:2]:
         board = each.board
         known = each.known
@@ -141,6 +154,9 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
             if path in found
         }
         if len(views) < FEWEST:
+            fewest = 1 if given else _ANOTHER
+            if len(views) >= max(fewest, seldom.views + 1 if seldom else 0):
+                seldom = SeldomSeen(board, len(views), len(images))
             continue
         camera = _camera(held, CameraModel(width, height), tuple(views.values()))
         if camera is not None:
@@ -159,7 +175,7 @@ def see_board(held: Contents, given: BoardSpec | None, paths: list[Path], progre
                 another=another,
                 size_told=each.size_told,
             )
-    return None
+    return seldom
 
 
 def _with_its_markers(

@@ -23,7 +23,7 @@ _BOARD = (
     r"|pattern|tag|aruco|charuco|grid)"
 )
 TOOL_POSE = re.compile(
-    r"base_(tcp|ee|tool|flange)|world_end|O_T_EE|t_base_tcp|robot_?(pose|coord|pos)|tool_?pose|\bhand\b"
+    r"base_(tcp|ee|tool|flange)|world_end|O_T_EE|t_base_tcp|robot_?(pose|coord|pos)|tool_?pose|\bhand\b|\btcp$"
     r"|(tcp|tool|eef|ee|end|gripper|arm|effector)_?(pose|xyz|data|coord)|robot_?data"
     r"|pose_(flange|tcp|tool|ee|gripper)|\bmove[jl]\b|(effector|hand)_(wrt|in)?_?world",
     re.I,

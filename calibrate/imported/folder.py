@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.model import describe_board
-from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boards
+from calibrate.handeye.blas_threads import one_blas_thread
+from calibrate.imported.board import FEWEST, GUESSED_M, Key, SeldomSeen, see_board, told_boards
 from calibrate.imported.mounting import joints_of, joints_rad, mounting
 from calibrate.imported.pair_readings import PairsRead, ask_unit, read_pairs, rescaled, scales
 from calibrate.imported.sets import (
@@ -117,6 +118,7 @@ def is_described(folder: Path, *given: object) -> bool:
     return described
 
 
+@one_blas_thread()
 def believe(
     held: Contents,
     given: Given = Given(),
@@ -144,27 +146,32 @@ def believe(
     sets = image_sets(held, robots, given.images)
     good: list[tuple[ImageSet, list[TableReading]]] = []
     tried: list[TableReading] = []
-    problem: ImportSourceError | None = None
+    of_sizes: ImportSourceError | None = None
+    unreadable: ImportSourceError | None = None
     board_seen = False
     without_board: list[str] = []
+    seldom: dict[str, SeldomSeen] = {}
     for each in sets:
         if good and each.is_made:
             break
         if any(same_pictures(each.paths, other.paths) for other, _ in good):
             continue
         if (sizes := _sizes(each.paths)) is not None:
-            problem = problem or ImportSourceError(
+            of_sizes = of_sizes or ImportSourceError(
                 "image-sizes", source=held.root, images=each.family, sizes=sizes
             )
             continue
         readings: list[TableReading] = []
         try:
             seen = see_board(held, given.board, each.paths, progress)
-        except ImportSourceError as unreadable:  # others may be pictures: maps of depths lie beside them
-            problem = problem or unreadable
+        except ImportSourceError as error:  # others may be pictures: maps of depths lie beside them
+            unreadable = unreadable or error
             continue
         if seen is None:
             without_board.append(each.family)
+        elif isinstance(seen, SeldomSeen):
+            without_board.append(each.family)
+            seldom[each.family] = seen
         else:
             board_seen = True
             for table, pairs in each.rows:
@@ -175,6 +182,7 @@ def believe(
         if len(good) > 1:
             rivals = [other for other in sets if not other.is_made]
             raise _several(held, [(other.family, _row_names(other)) for other in rivals])
+    problem = of_sizes or (None if without_board else unreadable)
     if good:
         tried = good[0][1]
     elif problem is not None and not tried:
@@ -187,16 +195,33 @@ def believe(
     if not tried and (board_seen or not sets):
         raise _no_pairs(held, robots)
     if not tried:
-        families = ", ".join(each.family for each in sets)
-        if given.board is None:
-            raise ImportSourceError("no-board-found", source=held.root, board="board", images=families)
-        said = describe_board(given.board)
-        raise ImportSourceError("told-board-unseen", source=held.root, board=said, images=families)
+        raise _no_board(held, given.board, without_board, seldom)
     tried = without_boards_own(held, tried)
     best = decide(held, tried, given.convention, given.mount)
     if best.seen.convention is None or not without_board:
         return _believed(held, given, best)
     return _believed_beside_images(held, given, best, _listed(without_board))
+
+
+def _no_board(
+    held: Contents, told: BoardSpec | None, families: list[str], seldom: dict[str, SeldomSeen]
+) -> ImportSourceError:
+    """Why images of `families` tell nothing of a board; `seldom`: those of them that show one too seldom."""
+    if seldom:
+        family, seen = max(seldom.items(), key=lambda each: each[1].views)
+        return ImportSourceError(
+            "board-seldom-seen",
+            source=held.root,
+            board=f"{seen.board.kind.value} {seen.board.columns}×{seen.board.rows}",
+            images=family,
+            seen=seen.views,
+            looked=seen.looked,
+            needed=FEWEST,
+        )
+    images = _listed(families)
+    if told is None:
+        return ImportSourceError("no-board-found", source=held.root, board="board", images=images)
+    return ImportSourceError("told-board-unseen", source=held.root, board=describe_board(told), images=images)
 
 
 def _believed_beside_images(held: Contents, given: Given, best: TableReading, images: str) -> Believed:

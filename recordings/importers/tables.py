@@ -317,10 +317,11 @@ def _folded(files: list[Path]) -> dict[Path, str]:
 def _joined(rows: dict[tuple[str, ...], list[_Row]]) -> Iterator[tuple[str, str, list[_Row]]]:
     """(name, rotation, rows) of whole poses, then of halves named alike but for which half they are.
 
-    OpenCV's `rvec` and `tvec` stay in the name of what is the board's, by its name or beside a table that is
-    named the robot's: they tell the direction of its poses.
+    OpenCV's `rvec` and `tvec` stay in the name of what is the board's, by its name or beside whole poses
+    that are the robot's or have no name: they tell the direction of its poses.
     """
     robot_named = any(whose_of(name) == "robot" for name, *_ in rows)
+    whole = {name for name, _, half, _ in rows if not half}
     halves = defaultdict[tuple[str, int], dict[str, tuple[str, ...]]](dict)
     for key, each in rows.items():
         if key[2]:
@@ -334,14 +335,16 @@ def _joined(rows: dict[tuple[str, ...], list[_Row]]) -> Iterator[tuple[str, str,
             at, turn = both["position"], both["rotation"]
             path, _, last = at[0].replace(" ", ".").rpartition(".")
             above = at[0][: len(path)]
-            is_opencvs = _OPENCVS.fullmatch(last) and turn[1] == "rotvec"
-            is_boards = whose_of(above) == "board" or (robot_named and whose_of(above) == "")
-            keeps_last = "_" in last or (is_opencvs and is_boards)
+            last_of_turn = turn[0].replace(" ", ".").rpartition(".")[2]
+            is_opencvs = _OPENCVS.fullmatch(last_of_turn) and turn[1] == "rotvec"
+            is_unnamed = whose_of(above) == ""
+            beside_robots = is_unnamed and (robot_named or above in whole)
+            name = turn[0] if is_opencvs and (whose_of(above) == "board" or beside_robots) else above
             for row, other in zip(rows[at], rows[turn], strict=True):
                 row.numbers += other.numbers
                 if len(row.numbers) == 12:  # a matrix has each row's number of the position behind it
                     row.numbers = [row.numbers[k] for k in (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2)]
-            yield at[0] if keeps_last else above, turn[1], rows[at]
+            yield at[0] if "_" in last else name, turn[1], rows[at]
 
 
 def _without_count(table: Array) -> Array:

@@ -87,7 +87,7 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> Shots:
 def _seen_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The board is looked for once in the same pictures, whatever their files are called."""
 
-    def seen(held: Any, given: Any, paths: list[Path], progress: Any) -> board.Seen | None:
+    def seen(held: Any, given: Any, paths: list[Path], progress: Any) -> board.Seen | board.SeldomSeen | None:
         keys = [_hash(path) for path in paths]
         facts = "" if given else repr(held.facts)
         key = given, len(held.cameras), facts, *keys
@@ -95,8 +95,8 @@ def _seen_once(monkeypatch: pytest.MonkeyPatch) -> None:
             found = board.see_board(held, given, paths, progress)
             _SEEN[key] = found, dict(zip(paths, keys, strict=True))
         found, hashes = _SEEN[key]
-        if found is None:
-            return None
+        if not isinstance(found, board.Seen):
+            return found
         renamed = dict(zip(keys, paths, strict=True))
         views = {renamed[hashes[path]]: view for path, view in found.views.items()}
         candidates = {renamed[hashes[path]]: each for path, each in found.candidates.items()}
@@ -105,7 +105,7 @@ def _seen_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("calibrate.imported.folder.see_board", seen)
 
 
-_SEEN: dict[object, tuple[board.Seen | None, dict[Path, str]]] = {}
+_SEEN: dict[object, tuple[board.Seen | board.SeldomSeen | None, dict[Path, str]]] = {}
 
 
 def require_right(
@@ -721,6 +721,28 @@ def test_maps_of_depths_alone_are_told(shots: Shots, tmp_path: Path) -> None:
     np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
     with raises("bad-image"):
         believe(look(tmp_path), GIVEN)
+
+
+def test_maps_of_depths_are_not_why_pictures_show_no_board(tmp_path: Path) -> None:
+    for n in range(VIEWS):
+        cv2.imwrite(str(tmp_path / f"cloud{n}.tiff"), np.zeros((384, 480), np.float32))
+        cv2.imwrite(str(tmp_path / f"pos{n}.png"), np.full((384, 480), 20 * n, np.uint8))
+    np.savetxt(tmp_path / "robot.txt", quaternions(np.array(Scene(views=VIEWS).flange_poses()[0])))
+    with raises("no-board-found", images="pos#.png"):
+        believe(look(tmp_path))
+
+
+@pytest.mark.parametrize("given", [GIVEN, Given(mount="eye-in-hand")])
+@pytest.mark.parametrize("seen", [2, 4])
+def test_a_board_in_a_few_of_many_images_is_counted(
+    seen: int, given: Given, shots: Shots, tmp_path: Path
+) -> None:
+    paths = save_images(shots, tmp_path, "{n}.png")
+    np.savetxt(tmp_path / "robot.txt", quaternions(shots.flanges["one"]))
+    for n, path in enumerate(paths[seen:]):
+        cv2.imwrite(str(path), np.full((384, 480), 20 * n, np.uint8))
+    with raises("board-seldom-seen", seen=seen, looked=VIEWS, images="#.png"):
+        believe(look(tmp_path), given)
 
 
 OPENCV = """%YAML:1.0

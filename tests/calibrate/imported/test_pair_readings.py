@@ -176,6 +176,8 @@ def test_a_question_tells_each_readings_x_and_the_option_that_chooses_it(tmp_pat
     error = json.loads(told.stdout)["error"]
     assert error["code"] == "several-readings"
     assert len(error["values"]["options"]) == 2
+    told_mm = sorted(error["values"]["translations_mm"])
+    np.testing.assert_allclose(told_mm, [[45, -30, 65], [480, 80, 15]], atol=1)
     for options in error["values"]["options"]:
         assert call(main, "import", tmp_path, "--dry-run", *shlex.split(options)).returncode == 0
 
@@ -208,7 +210,8 @@ def test_tf_and_opencv_names_tell_directions() -> None:
     assert directions("gripper_to_base", "target_to_camera") == Told(False, False)
     assert directions("base_to_hand", "camera_to_marker") == Told(same=True)  # tf, or maps of both
     assert directions("base_to_gripper", "target_to_camera") == Told(same=False)
-    assert directions("tcp", "camera_in_board") == Told(None, True)
+    assert directions("arm", "camera_in_board") == Told(None, True)
+    assert directions("samples.csv tcp", "board") == Told(False)
     assert directions("robot", "marker") == Told()
     assert unit_named("x_cm y_cm") == "cm"
     assert unit_named("tx_in rx pos_in_base") == "inch"
@@ -384,16 +387,41 @@ def test_opencvs_rvec_and_tvec_are_a_rotation_vector_of_the_board_in_the_camera(
     assert cell.is_read(believe(look(tmp_path)))
 
 
-@pytest.mark.parametrize("columns", ["rvec_{}", "board_rvec_{}"])
-def test_columns_of_opencvs_names_tell_the_form(columns: str, tmp_path: Path) -> None:
-    cell = Cell()
+def write_opencvs_columns(folder: Path, cell: Cell, robot: str, position: str, turn: str) -> Path:
+    """One CSV whose columns are named by the robot's `x`, `y` … and by OpenCV's two halves of the board's."""
     flange, C = cell.truth
     rows = np.column_stack([quaternions(flange), C[:, :3, 3], Rotation.from_matrix(C[:, :3, :3]).as_rotvec()])
-    names = [f"tcp_pose_{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    names += [columns.replace("rvec", "tvec").format(part) for part in "xyz"]
-    names += [columns.format(part) for part in "xyz"]
-    np.savetxt(tmp_path / "pairs.csv", rows, delimiter=",", header=",".join(names), comments="")
-    assert cell.is_read(believe(look(tmp_path)))
+    names = [f"{robot}{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    names += [position.format(part) for part in "xyz"]
+    names += [turn.format(part) for part in "xyz"]
+    np.savetxt(folder / "pairs.csv", rows, delimiter=",", header=",".join(names), comments="")
+    return folder
+
+
+OPENCVS_COLUMNS = [
+    ("tvec_{}", "rvec_{}"),
+    ("board_tvec_{}", "board_rvec_{}"),
+    ("tvec{}", "rvec{}"),
+    ("t{}", "rvec_{}"),
+]
+
+
+@pytest.mark.parametrize("robot", ["tcp_pose_", "tcp_"])
+@pytest.mark.parametrize(("position", "turn"), OPENCVS_COLUMNS)
+def test_columns_of_opencvs_names_tell_the_form(position: str, turn: str, robot: str, tmp_path: Path) -> None:
+    """A TCP is told in the base by every pendant, and OpenCV tells the board in the camera."""
+    cell = Cell()
+    assert cell.is_read(believe(look(write_opencvs_columns(tmp_path, cell, robot, position, turn))))
+
+
+@pytest.mark.parametrize(("position", "turn"), OPENCVS_COLUMNS)
+def test_columns_of_opencvs_names_are_the_boards_beside_an_unnamed_pose(
+    position: str, turn: str, tmp_path: Path
+) -> None:
+    cell = Cell()
+    with raises("several-readings", SeveralReadingsError):
+        believe(look(write_opencvs_columns(tmp_path, cell, "", position, turn)))
+    assert any(map(cell.is_read, answered(tmp_path, Given())))
 
 
 def test_rvec_and_tvec_of_a_robot_stay_the_robots(tmp_path: Path) -> None:

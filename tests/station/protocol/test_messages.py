@@ -99,7 +99,14 @@ def test_every_answer_is_a_line_of_json(result: Any) -> None:
 
 @pytest.mark.parametrize(
     ("value", "plain"),
-    [(np.float64(1.5), 1.5), (np.int8(3), 3), (np.bool_(False), False), (Word.ONE, "one"), (Path("a"), "a")],
+    [
+        (np.float64(1.5), 1.5),
+        (np.int8(3), 3),
+        (np.bool_(False), False),
+        (Word.ONE, "one"),
+        (Path("a"), "a"),
+        ([[45.0, -30, 65.5], None, "a", ["b"]], [[45.0, -30.0, 65.5], None, "a", "['b']"]),
+    ],
 )
 def test_values_are_converted_by_their_type(value: object, plain: object) -> None:
     assert plain_value(value) == plain and type(plain_value(value)) is type(plain)

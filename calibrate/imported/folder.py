@@ -434,7 +434,7 @@ def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
     board, square = _board(best)
     facts = {
         "images": (f"{len(pairs)} {best.family}", f"board in {len(seen.views)} of {seen.looked} looked at"),
-        "poses": (f"{len(pairs)} rows of {best.table.name}", best.told),
+        "poses": (f"{len(pairs)} rows of {best.table.name}", _evidence(best)),
         "convention": (
             how.name,
             f"board stays within {1e3 * best.stays_m:.1f} mm, {np.degrees(best.stays_rad):.2f}°",
@@ -480,6 +480,13 @@ def _believed(held: Contents, given: Given, best: TableReading) -> Believed:
     describes = seen.camera_known or (seen.square_known and not saw)
     unused = _unused(held, used | (held.described_by if describes else set()))
     return Believed(dataset, _rows(held, best.table, how, pairs, saw, joints, axes), facts, unused)
+
+
+def _evidence(best: TableReading) -> str:
+    """What the numbers of the robot's table show, and which other tables give the same X."""
+    if not best.same_result:
+        return best.told
+    return f"{best.told}; {_listed([*best.same_result])} would give the same X"
 
 
 def _unused(held: Contents, used: set[str]) -> list[str]:

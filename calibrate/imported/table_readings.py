@@ -52,6 +52,8 @@ _MOVES = 0.01
 """No arm's poses differ less, metres, radians or more: such a table is of what stands."""
 _STAYS_M, _STAYS_RAD = 0.015, 0.05
 """Median distance of the board from its place above which no reading is believed."""
+_SAME = 2e-3
+"""Two results that differ less, metres and radians, are of one camera."""
 _SIZES = 0.01, 10.0
 """Factors of squares guessed that are still a board's."""
 _FARTHEST_M = 20.0
@@ -84,6 +86,8 @@ class TableReading:
     """Evidence by the numbers alone."""
     inliers: NDArray[np.bool_] | None = None
     """(n,) views that agree, where many do not; None: by the fit."""
+    same_result: tuple[str, ...] = ()
+    """Other tables that fit as well and give the same X."""
 
     @property
     def text(self) -> str:
@@ -341,12 +345,23 @@ def decide(
         if beaten or not as_told or read_otherwise:
             raise ImportSourceError("no-reading", source=held.root, **nearest)
     best = mine[0]
+    same_result: list[str] = []
     for other in mine[1:]:
         if _beats(best, other) or is_good(other) != is_good(best):
             break
-        if not _same(best, other):
+        if _of_same_camera(best, other):
+            same_result.append(other.table.name)
+        elif not _same(best, other):
             raise several_readings(held.root, [_as_asked(best), _as_asked(other)], _BY_WRITER)
-    return best
+    return replace(best, same_result=tuple(dict.fromkeys(same_result)))
+
+
+def _of_same_camera(one: TableReading, other: TableReading) -> bool:
+    """Tell whether two tables give one X: a fixed camera's is the same by any part of the arm that carries
+    the board, and that of a camera in hand is the same in any base."""
+    X, other_X = one.fit.X[0], other.fit.X[0]
+    is_other_table = one.table is not other.table and one.mount == other.mount
+    return is_other_table and bool(np.abs(X - other_X).max() < _SAME)
 
 
 def _as_asked(reading: TableReading) -> StandingReading:

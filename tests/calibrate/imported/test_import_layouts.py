@@ -620,6 +620,36 @@ def test_a_grid_of_places_is_one_table(shots: Shots, tmp_path: Path) -> None:
     assert require_right(shots, tmp_path) == {"one"}
 
 
+FIXED = Scene(views=VIEWS, seed=3, mount="eye-to-hand")
+FINGER = pose(rotation_exp([0, 0, 0.3]), [0.01, 0.02, 0.08])
+
+
+def write_hand_and_finger(folder: Path, flange: np.ndarray) -> None:
+    rows = [{"arm_hand": T.tolist(), "arm_finger": (T @ FINGER).tolist()} for T in flange]
+    (folder / "poses.json").write_text(json.dumps(rows))
+
+
+def test_poses_of_several_parts_of_an_arm_give_a_fixed_camera_one_x(tmp_path: Path) -> None:
+    """Hand and finger carry the same board."""
+    recording = open_recording(write_session(tmp_path / "s.mcap", FIXED))
+    for view, image in recording.images():
+        cv2.imwrite(str(tmp_path / f"{view.index}.png"), image.pixels)
+    (tmp_path / "s.mcap").unlink()
+    write_hand_and_finger(tmp_path, np.array([view.base_from_flange for view in recording.views()]))
+    found = believe(look(tmp_path), Given(mount="eye-to-hand", board=PAPER_BOARD))
+    assert "the same X" in found.facts["poses"][1]
+
+
+def test_which_part_of_an_arm_carries_a_camera_is_asked(shots: Shots, tmp_path: Path) -> None:
+    save_images(shots, tmp_path, "{n}.png")
+    write_hand_and_finger(tmp_path, shots.flanges["one"])
+    with raises("several-readings", SeveralReadingsError) as asked:
+        believe(look(tmp_path), GIVEN)
+    assert isinstance(asked.value, SeveralReadingsError)
+    tables = {reading.options["poses"] for reading in asked.value.readings}
+    assert tables == {"poses.json arm_hand", "poses.json arm_finger"}
+
+
 # ---- too few, and what are no poses
 
 

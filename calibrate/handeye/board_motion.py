@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.views.view_set import ViewSet
-from recordings.geometry import Array, inverse, project_to_rotation, rotation_angle
+from recordings.geometry import Array, inverse, project_to_rotation, rotation_angle, rotation_log
 
 _TURN_RAD = np.radians(2.0)
 """Median difference of rotations of two programs' poses of one board, at most."""
@@ -32,6 +32,8 @@ _FOCAL = 1.25
 """Factor by which the lens of two programs differs, at most."""
 _EXTENT = 0.5
 """Of a board of unknown size, over its distance."""
+_LEVER_M = 0.5
+"""Lever by which rotations are converted to lengths."""
 _FEWEST = 4
 _CAMERAS = np.array([np.eye(3), np.diag([1.0, -1.0, -1.0])])
 """A camera's own axes, and those of OpenGL."""
@@ -59,6 +61,29 @@ def boards_own_motion(flange: Array, boards: Array, extent_m: float = 0.0) -> Bo
         _nearness(poses, boards, extent_m, axes) for poses in (flange, inverse(flange)) for axes in _CAMERAS
     )
     return next((near for near in found if near is not None), None)
+
+
+def pairs_moves_m(H: Array, C: Array, size_known: bool) -> Array:
+    """Compute how far the board moves between views that are near, by the X that fits all such pairs best.
+
+    H: (n, 4, 4) mounted poses, as of `mount_poses`; C: (n, 4, 4) camera_from_board; size_known: lengths of
+    both are of one unit, else their ratio is found, too. Returns (m,) metres, radians count at half a metre.
+    Rotation and translation apart: F. Park, B. Martin, "Robot sensor calibration: solving AX = XB on the
+    Euclidean group" (1994).
+    """
+    i, k = np.array([(i, i + step) for step in (1, 2, 3) for i in range(len(H) - step)]).T
+    A = inverse(H[k]) @ H[i]
+    B = C[k] @ inverse(C[i])
+    alpha, beta = rotation_log(A[:, :3, :3]), rotation_log(B[:, :3, :3])
+    U, _, Vt = np.linalg.svd(alpha.T @ beta)
+    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    shift = B[:, :3, 3] @ R.T
+    J, right = A[:, :3, :3] - np.eye(3), shift - A[:, :3, 3]
+    if not size_known:
+        J, right = np.concatenate([J, -shift[..., None]], axis=2), -A[:, :3, 3]
+    t = np.linalg.lstsq(J.reshape(-1, J.shape[2]), right.ravel(), rcond=None)[0]
+    turned = np.linalg.norm(alpha - beta @ R.T, axis=1)
+    return np.asarray(np.linalg.norm(J @ t - right, axis=1) + _LEVER_M * turned)
 
 
 def board_extent_m(views: ViewSet) -> float:

@@ -15,6 +15,8 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calibrate.handeye.axxb.pairs import mount_poses
+from calibrate.handeye.board_motion import pairs_moves_m
 from calibrate.handeye.changes import ChangeSearch, errors_by_posture, is_claimed
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.pose_fit import FREE, BoardPoses, PoseFit, PoseViews, fit_poses, pose_views
@@ -39,6 +41,8 @@ _SIZE, _FOCAL = 0, 1
 """Indices of the factors of `pose_views`."""
 _NEAR = 0.1
 """Relative distance of a factor from 1000 within which millimetres were given for metres."""
+_AGREE = 0.25
+"""Share of the pairs of views that agree although half of the views are outliers."""
 _LEAST = 0.01
 """Relative distance of a factor from 1 below which it is a tolerance, not another reading."""
 
@@ -53,6 +57,9 @@ _SCALES = (1.0, *_LARGER, *(1 / scale for scale in _LARGER))
 _MIDDLE = 0.1
 """Relative distance of a lens's principal point from the middle of its image that is usual."""
 _FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL}
+_ALWAYS_FITTED = (*_FACTOR, Reading.ANGLES_AS_ROTATION_VECTOR, Reading.ROTATION_VECTOR_AS_ANGLES)
+"""Factors are found by the fit alone. Angles beyond a half turn are not got back from a rotation vector, so
+that the board stays in a part of the views only."""
 
 
 def explain_recording(
@@ -71,8 +78,11 @@ def explain_recording(
     as_recorded = _fit(views, seed)
     base = -np.inf if as_recorded is None else as_recorded.log_evidence
     held = [explain_changes(views, seed, by_links, as_recorded)]
+    moved_m = _moved_m(views)
     for reading, changed, at, charge in _readings(views):
         if unmirrored and reading is Reading.MIRRORED:
+            continue
+        if reading not in _ALWAYS_FITTED and _moved_m(changed) > moved_m:  # it explains nothing
             continue
         fit = _fit(changed, seed)
         if fit is not None:
@@ -84,6 +94,14 @@ def explain_recording(
     if found.reading is Reading.AS_RECORDED and as_recorded is not None and _only_positions(as_recorded):
         return replace(found, reading=Reading.POSITIONS_DISAGREE)
     return found
+
+
+def _moved_m(views: PoseViews) -> float:
+    """How far the board moves between the quarter of the pairs of views that agree best: the rest may be
+    outliers."""
+    H = mount_poses(views.flange, views.mount)
+    size_known = views.boards.sigma[_SIZE] < FREE
+    return float(np.quantile(pairs_moves_m(H, views.boards.C, bool(size_known)), _AGREE))
 
 
 def _explanation(reading: Reading, fit: PoseFit, at: int, gain: float) -> Explanation:

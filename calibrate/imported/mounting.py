@@ -5,7 +5,9 @@ hand fits exactly as well as a fixed one with inverted poses, so the motion give
 other two are known. What the user tells decides, and recorded joints do: they may not contradict each other.
 A single hint against what is told is named beside it, two are a question. Where nothing is told hints decide,
 no two of which may contradict each other: names, what the images show around the board, and the distances of
-camera and board from flange and base. Of the last two alone both are needed.
+camera and board from flange and base. One of the last two is enough where it agrees with poses of the tool in
+the base, which is what arms tell. Only both together say that poses are inverted: a frame at the table or a
+picture filled by the arm deceives one of them.
 """
 
 from __future__ import annotations
@@ -86,9 +88,10 @@ def mounting(
         doubt = f", against {' and '.join(against)}" if against else ""
         by = "as told" if given else "by the convention as told" if told else "by joints"
         return mount, mount != fits, f"{by}{doubt}; {best.table.name}"
-    # A bare wall, a gripper in the picture, or a frame at the table deceives one of the last two alone.
     names, scene, distances = hints.values()
-    possible = names | scene | distances if names or (scene and distances) else set()
+    straight = {fits}
+    is_enough = bool(names or (scene and distances)) or straight in (scene, distances)
+    possible = names | scene | distances if is_enough else set()
     why = {what: says for what, says in hints.items() if says}
     if len(possible) != 1:
         said = _said(why) or "nothing tells which"

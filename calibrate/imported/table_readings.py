@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calibrate.boards.model import has_markers
 from calibrate.handeye.axxb.pairs import mount_poses
-from calibrate.handeye.board_motion import BoardMotion, board_extent_m, boards_own_motion
+from calibrate.handeye.board_motion import BoardMotion, board_extent_m, boards_own_motion, pairs_moves_m
 from calibrate.handeye.changes import ChangeSearch, errors_by_posture
 from calibrate.handeye.pose_fit import (
     FREE,
@@ -33,7 +33,7 @@ from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates, with_poses
 from calibrate.views.view_set import Places, ViewSet
 from recordings.errors import ImportSourceError, StandingReading, several_readings
-from recordings.geometry import Array, inverse, rotation_angle, rotation_log
+from recordings.geometry import Array, difference, inverse, rotation_angle
 from recordings.importers.conventions import Convention, convention, possible, tells_direction
 from recordings.importers.tables import Contents, Table
 from recordings.schema.messages import Mount
@@ -54,6 +54,8 @@ _STAYS_M, _STAYS_RAD = 0.015, 0.05
 """Median distance of the board from its place above which no reading is believed."""
 _SAME = 2e-3
 """Two results that differ less, metres and radians, are of one camera."""
+_IMMATERIAL = 1 / 3
+"""Share of the uncertainty of X below which a difference is of no consequence."""
 _SIZES = 0.01, 10.0
 """Factors of squares guessed that are still a board's."""
 _FARTHEST_M = 20.0
@@ -186,26 +188,12 @@ def fitted_again(reading: TableReading, how: Convention, seen: Seen) -> TableRea
 
 
 def _moves(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> float:
-    """How far the board moves, metres, radians at half a metre: median by the X of all pairs of near views.
-
-    Rotation and translation apart: F. Park, B. Martin, "Robot sensor calibration: solving AX = XB on the
-    Euclidean group" (1994).
-    """
+    """How far the board moves, metres, radians at half a metre: median of all pairs of near views."""
     options = [np.array([each.camera_from_board for each in seen.candidates[key]]) for key in keys]
     chosen = choose_candidates(options, flange, mount) if max(map(len, options)) > 1 else [0] * len(keys)
-    C, H = np.array([each[k] for each, k in zip(options, chosen, strict=True)]), mount_poses(flange, mount)
-    i, k = np.array([(i, i + step) for step in (1, 2, 3) for i in range(len(H) - step)]).T
-    A, B = inverse(H[k]) @ H[i], C[k] @ inverse(C[i])
-    alpha, beta = rotation_log(A[:, :3, :3]), rotation_log(B[:, :3, :3])
-    U, _, Vt = np.linalg.svd(alpha.T @ beta)
-    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    shift = B[:, :3, 3] @ R.T
-    J, right = A[:, :3, :3] - np.eye(3), shift - A[:, :3, 3]
-    if not seen.square_known:
-        J, right = np.concatenate([J, -shift[..., None]], axis=2), -A[:, :3, 3]
-    t = np.linalg.lstsq(J.reshape(-1, J.shape[2]), right.ravel(), rcond=None)[0]
-    moved = np.linalg.norm(J @ t - right, axis=1) + 0.5 * np.linalg.norm(alpha - beta @ R.T, axis=1)
-    return float(np.median(moved))
+    C = np.array([each[k] for each, k in zip(options, chosen, strict=True)])
+    moved_m = pairs_moves_m(mount_poses(flange, mount), C, seen.square_known)
+    return float(np.median(moved_m))
 
 
 def _fitted(
@@ -359,9 +347,13 @@ def decide(
 def _of_same_camera(one: TableReading, other: TableReading) -> bool:
     """Tell whether two tables give one X: a fixed camera's is the same by any part of the arm that carries
     the board, and that of a camera in hand is the same in any base."""
-    X, other_X = one.fit.X[0], other.fit.X[0]
     is_other_table = one.table is not other.table and one.mount == other.mount
-    return is_other_table and bool(np.abs(X - other_X).max() < _SAME)
+    try:
+        sigma = np.sqrt(np.diag(np.linalg.inv(one.fit.solved.precision)))[:6]
+    except np.linalg.LinAlgError:
+        return False
+    apart = np.abs(difference(one.fit.X[0], other.fit.X[0]))
+    return is_other_table and bool((apart < np.maximum(_SAME, _IMMATERIAL * sigma)).all())
 
 
 def _as_asked(reading: TableReading) -> StandingReading:

@@ -170,12 +170,17 @@ def test_what_nothing_tells_is_asked(put: Callable[..., Path], images: tuple[Pat
     np.testing.assert_allclose(turned, np.linalg.inv(told), atol=1e-6)
 
 
-@pytest.mark.parametrize("change", [lambda T: T, np.linalg.inv])
-def test_distances_of_camera_and_board_contradict_but_do_not_tell_the_mounting_alone(
-    change: Callable[[np.ndarray], np.ndarray], put: Callable[..., Path], images: tuple[Path, np.ndarray]
+def test_distances_confirm_poses_of_the_tool_in_the_base(put: Callable[..., Path]) -> None:
+    """Arms tell them, so that one hint to the same is enough."""
+    found = believe(look(put(unnamed)))
+    assert (found.dataset.mount, found.dataset.poses.convention) == ("eye-in-hand", "euler-ZYX-deg-mm")
+
+
+def test_distances_of_camera_and_board_contradict_but_do_not_say_alone_that_poses_are_inverted(
+    put: Callable[..., Path], images: tuple[Path, np.ndarray]
 ) -> None:
     """A frame at the table or a camera near the base would deceive them."""
-    folder = put(unnamed, change)
+    folder = put(unnamed, np.linalg.inv)
     assert look(folder, Path("poses.txt")).told and not look(folder, Path("others")).told
     with raises("which-mount"):
         believe(look(folder))

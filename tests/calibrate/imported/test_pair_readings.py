@@ -266,7 +266,7 @@ def test_axes_that_are_told_make_the_camera_optical(axes: CameraAxes, told: str,
 
 def shell(given: Given) -> Iterator[str]:
     for name, value in vars(given).items():
-        if value is not None:
+        if value:
             yield from (f"--{name.replace('_', '-')}", value)
 
 

@@ -54,8 +54,8 @@ _STAYS_M, _STAYS_RAD = 0.015, 0.05
 """Median distance of the board from its place above which no reading is believed."""
 _SAME = 2e-3
 """Two results that differ less, metres and radians, are of one camera."""
-_IMMATERIAL = 1 / 3
-"""Share of the uncertainty of X below which a difference is of no consequence."""
+_IMMATERIAL = 0.5
+"""Share of the uncertainty of a fixed camera's X below which a difference is of no consequence."""
 _SIZES = 0.01, 10.0
 """Factors of squares guessed that are still a board's."""
 _FARTHEST_M = 20.0
@@ -347,13 +347,15 @@ def decide(
 def _of_same_camera(one: TableReading, other: TableReading) -> bool:
     """Tell whether two tables give one X: a fixed camera's is the same by any part of the arm that carries
     the board, and that of a camera in hand is the same in any base."""
-    is_other_table = one.table is not other.table and one.mount == other.mount
+    if one.table is other.table or one.mount != other.mount:
+        return False
     try:
         sigma = np.sqrt(np.diag(np.linalg.inv(one.fit.solved.precision)))[:6]
     except np.linalg.LinAlgError:
         return False
     apart = np.abs(difference(one.fit.X[0], other.fit.X[0]))
-    return is_other_table and bool((apart < np.maximum(_SAME, _IMMATERIAL * sigma)).all())
+    immaterial = _IMMATERIAL * sigma if one.mount == "eye-to-hand" else 0.0 * sigma
+    return bool((apart < np.maximum(_SAME, immaterial)).all())
 
 
 def _as_asked(reading: TableReading) -> StandingReading:

@@ -175,6 +175,41 @@ class CrossValidation:
     """Limit of `rms_mm` over `claimed_mm`; above it the stated uncertainties are too small."""
 
 
+class PointError(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Error of a point as the arm will place it, for the X that is installed and the controller's flanges.
+
+    A picture is taken at one posture, and the tool is sent to the point at another (`handeye.placed_point`).
+    Root mean squares of its length, over pairs of postures and all that is uncertain. The three parts add up
+    as squares to `error_mm`.
+    """
+
+    error_mm: float
+    """At the recorded postures."""
+    at_m: float
+    """Distance of the point from the camera, on its axis."""
+    p95_mm: float
+    """Distance within which 95 of 100 points are placed."""
+    workspace_mm: float
+    """As `error_mm`, at postures all over the arm's workspace, or the range of its joints."""
+    from_x_mm: float
+    """Part of the noise of corners and robot in the views, by X."""
+    from_arm_mm: float
+    """Part of the arm: its errors at both postures, and what it does differently each time."""
+    from_board_lens_mm: float
+    """Part of what is uncertain of board and lens."""
+    floor_mm: float
+    """What would be left of `error_mm` if each view were repeated without end: no calibration lowers it."""
+    with_more_views_mm: float
+    """What ten more views like these would leave of `error_mm`."""
+    arm: Literal["told", "learned", "assumed"]
+    """Whence the arm's errors are known: its kinematics or its accuracy were told, they were learned from
+    recorded joints, or their size is assumed by its class."""
+    arm_class: str = ""
+    """The class where they are assumed (`arms.classes`)."""
+    corrected_mm: float | None = None
+    """`error_mm` by the corrected arm (`arm_table`); None: it is not offered."""
+
+
 class QualityFigures(msgspec.Struct, frozen=True, omit_defaults=True):
     """Figures that say how good X is: judged by gates, and written to the file as they are."""
 
@@ -186,12 +221,14 @@ class QualityFigures(msgspec.Struct, frozen=True, omit_defaults=True):
     """Root mean square distance of the board's origin in base (or flange), view by view, from its mean."""
     board_spread_deg: float | None = None
     predicted_error_mm: float | None = None
-    """1σ (root of the mean squared length) of a point at the working distance on the camera's axis, for the
-    X that is installed."""
+    """Error of a point at the working distance: `point.error_mm`. In files without `point`: by X alone, where
+    the arm's own errors at another posture are left out."""
     working_distance_m: float | None = None
     error_shares: dict[str, float] = {}
     """Source of the error of X → its share of the variance."""
     cross_validation: CrossValidation | None = None
+    point: PointError | None = None
+    """None in files of before, and for the paper profile."""
 
 
 class ArmErrorValue(msgspec.Struct, frozen=True):

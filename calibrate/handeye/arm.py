@@ -57,7 +57,7 @@ def arm_postures(views: ViewSet, used: NDArray[np.bool_]) -> tuple[ArmPostures |
             return ArmPostures(learned.chain, joints, True), note
     if published is None or model is None:
         return None, note
-    found = _joints_of_one_branch(published, flanges)
+    found = joints_of_one_branch(published, flanges)
     return (None if found is None else ArmPostures(chain_of(model), found, False, model)), note
 
 
@@ -134,7 +134,7 @@ def recorded_joints(views: ViewSet) -> Array | None:
     return joints if np.isfinite(joints).all() else None
 
 
-def _joints_of_one_branch(model: RobotModel, flanges: Array) -> Array | None:
+def joints_of_one_branch(model: RobotModel, flanges: Array) -> Array | None:
     """Find joints (n, 6) in one branch of inverse kinematics that reaches all flanges, else None.
 
     X comes out the same in any branch, as long as all views use the same one.

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import special
 
 from calibrate.handeye.arm import FLEX
+from calibrate.handeye.assumed_arm import LinkSizes
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import Estimate, MixtureParts, estimate
 from calibrate.handeye.linear import Linear, LinearSolution
@@ -26,10 +27,15 @@ from recordings.geometry import Array
 
 SIZES = 0.0075 * 2.0 ** np.arange(10)
 """1σ of the shifts (mm) and turns (mrad) of the arm's links, from what no view can tell from none."""
+LARGER_SIZES = 0.0075 * 2.0 ** np.arange(12)
+"""The same for an arm whose class has errors of centimetres."""
 BENDS = np.array([SIZES[0], 0.1, 0.4, 1.6])
 """1σ of a bracket's compliance, mrad, from what no view can tell from none."""
 RIGID = 0.5
 """Probability that a bracket does not bend; the other `BENDS` share the rest equally."""
+OCTAVES = 1.0
+"""1σ of the size of an arm's errors about that of its class, as a power of two: what different makers and
+laboratories state of one class differs by a factor of about two."""
 _ROUNDS = 3
 """Rounds of `Linear.solve` for each combination: few, as it starts with the noise found for a neighbour."""
 _LEAST = float(np.log(1e-2))
@@ -44,12 +50,21 @@ _NONE: Sizes = (0, 0, 0)
 class _Sizes:
     """All combinations of sizes, and the prior of the errors for each."""
 
-    def __init__(self, by_arm: int) -> None:
-        """Take the number of the arm's errors: 3 shifts, then 3 turns, and so on; a bracket's follow."""
+    def __init__(self, by_arm: int, expected: LinkSizes | None = None) -> None:
+        """Take the number of the arm's errors: 3 shifts, then 3 turns, and so on; a bracket's follow.
+
+        expected: the sizes that the arm's class has; None: all are as likely.
+        """
         self.kinds = np.repeat([*np.tile([0, 1], by_arm // 6), 2], [*np.full(by_arm // 3, 3), len(FLEX)])
         """(q,) size that an error goes by, as a place in `Sizes`: 0 shift, 1 turn, 2 bend."""
-        size = len(SIZES) if by_arm else 1
+        self.of_links = np.asarray(SIZES if expected is None else LARGER_SIZES, dtype=np.float64)
+        size = len(self.of_links) if by_arm else 1
         self.shape = (size, size, len(BENDS))
+        self._log_chance = np.full(self.shape[:2], -2 * np.log(size))
+        if expected is not None:
+            by_shift = _about(expected.shift_mm, self.of_links)
+            by_turn = _about(expected.turn_mrad, self.of_links)
+            self._log_chance = by_shift[:, None] + by_turn
 
     @property
     def alike(self) -> list[Sizes]:
@@ -59,12 +74,12 @@ class _Sizes:
     def sigma(self, one: Sizes) -> Array:
         """1σ (q,) of each error, mm and mrad."""
         shift, turn, bend = one
-        return np.asarray(np.array([SIZES[shift], SIZES[turn], BENDS[bend]])[self.kinds])
+        return np.asarray(np.array([self.of_links[shift], self.of_links[turn], BENDS[bend]])[self.kinds])
 
     def log_chance(self, one: Sizes) -> float:
         """Log probability of a combination."""
         bend = RIGID if one[2] == 0 else (1 - RIGID) / (len(BENDS) - 1)
-        return float(np.log(bend / (self.shape[0] * self.shape[1])))
+        return float(np.log(bend) + self._log_chance[one[0], one[1]])
 
     def beside(self, one: Sizes) -> list[Sizes]:
         """Return the combinations in which one size is the next smaller or larger."""
@@ -73,21 +88,28 @@ class _Sizes:
         return [(a, b, c) for a, b, c in steps[inside].tolist()]
 
 
+def _about(size: float, sizes: Array) -> Array:
+    """Log probability of each of `sizes` by a log-normal distribution about `size`."""
+    square = (np.log2(sizes / size) / OCTAVES) ** 2
+    return np.asarray(-square / 2 - special.logsumexp(-square / 2))
+
+
 def estimate_with_arm_errors(
-    observed: Observations, plain: Estimate, priors: Priors
+    observed: Observations, plain: Estimate, priors: Priors, expected: LinkSizes | None = None
 ) -> tuple[Estimate, float]:
     """Estimate again with systematic errors of arm and bracket, starting from the estimate without them.
 
     The last errors of `observed` are a bracket's (`FLEX`), those before them the arm's: of its links or,
-    where they are unknown, of its flange. The second value is the log evidence of errors of any size against
-    none; above 3 they are worth saying. Raises LinAlgError or BadViewsError where it fails.
+    where they are unknown, of its flange. expected: the sizes of the arm's class, where nothing else tells
+    them. The second value is the log evidence of errors of any size against none; above 3 they are worth
+    saying. Raises LinAlgError or BadViewsError where it fails.
     """
     state = replace(plain.state, arm_errors=np.zeros(observed.by_arm_errors.shape[2]))
-    sizes = _Sizes(len(state.arm_errors) - len(FLEX))
+    sizes = _Sizes(len(state.arm_errors) - len(FLEX), expected)
     # The rounds of linearisation are those of the likeliest alike sizes; all are averaged where these end.
     solve = partial(_solve, Linear.at(observed, state, plain.corner_weights), priors, state)
     alike = {one: solve(sizes.sigma(one), plain.scales) for one in sizes.alike}
-    likeliest = max(alike, key=lambda one: alike[one].log_evidence)
+    likeliest = max(alike, key=lambda one: sizes.log_chance(one) + alike[one].log_evidence)
     scales = replace(alike[likeliest].scales, arm_error_sigma=sizes.sigma(likeliest))
     settled = estimate(observed, state, priors, scales, fit="robot")
     linear = Linear.at(observed, settled.state, settled.corner_weights)

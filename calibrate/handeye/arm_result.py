@@ -10,6 +10,7 @@ from calibrate.handeye.arm_table import CorrectedArm, FramePose, HeldOutViews
 from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.solution import UncorrectedArm, camera_frames
+from calibrate.handeye.stated_point import corrected_error_mm, uncorrected_error_mm
 from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
 from recordings.geometry import Array, Transform, difference, perturb
 
@@ -56,8 +57,8 @@ def arm_results(
         model="" if table is None else table.name,
         nominal_source="learned" if table is None else "published" if fit.views.arm is None else "factory",
         covariance=tuple(tuple(row) for row in covariance.tolist()),
-        with_table_mm=1e3 * corrected_m,
-        without_table_mm=1e3 * uncorrected.error_m,
+        with_table_mm=corrected_error_mm(fit, arm, distance_m),
+        without_table_mm=uncorrected_error_mm(fit, uncorrected.X, distance_m),
         nominal=None if table is None else DhTable.of(table),
         learned=chain.plain if table is None else None,
         joints_rad=[(min(q), max(q)) for q in arm.joints_rad.T.tolist()],

@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibrate.arms.classes import ARM_CLASSES, UNKNOWN, ArmClass
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.handeye.arm import ArmPostures, arm_postures, flange_extent, flex_motion, smooth_motion
 from calibrate.handeye.arm_fit import estimate_with_arm_errors
+from calibrate.handeye.assumed_arm import TOLD, assumed_postures, link_sizes
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.cell_state import CellState
@@ -36,6 +38,17 @@ MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
 
 
 @dataclass(frozen=True, eq=False)
+class AssumedArm:
+    """The fit of an arm that stands in for one whose joints and kinematics nobody told."""
+
+    arm: ArmPostures
+    """A typical arm, with its joints in the views at `places`."""
+    places: Places
+    observed: Observations
+    estimate: Estimate
+
+
+@dataclass(frozen=True, eq=False)
 class CellFit:
     """Result of `fit_cell`: the estimate and what is needed to judge it."""
 
@@ -54,6 +67,8 @@ class CellFit:
     """The estimate without systematic errors of arm and bracket."""
     smooth: Estimate | None
     """The estimate for flanges that err smoothly, whatever the joints say; None where not modelled."""
+    assumed: AssumedArm | None
+    """The estimate for an arm of this class; None where `arm` is known, or no typical arm reaches the views."""
     pairs: Pairs
     """Pairs of the views that count."""
     certified: GlobalResult
@@ -62,25 +77,35 @@ class CellFit:
     """Why systematic errors could not be fitted, where that failed."""
     joints_note: str = ""
     """What is unusual about the recorded joints."""
+    of_class: ArmClass = ARM_CLASSES[UNKNOWN]
+    """How far such an arm is off, where neither its joints nor its kinematics are told."""
+
+    @property
+    def accuracy_told(self) -> bool:
+        """Whether `of_class` holds figures that were told of this very arm."""
+        return self.of_class.name == TOLD
 
     @property
     def unknown_arm(self) -> Array:
         """Compute what errors of an arm of unknown kinematics add to the covariance (6, 6) of X.
 
-        X stays where it fits the flanges as they are told. Its distance from the mean with smooth errors is
+        X stays where it fits the flanges as they are told. Its distance from the mean with such errors is
         error.
         """
-        if self.arm is not None or self.smooth is None:
+        fitted = self.smooth if self.assumed is None else self.assumed.estimate
+        if self.arm is not None or fitted is None:
             return np.zeros((6, 6))
-        found, smooth = self.estimate, self.smooth
-        off = difference(smooth.state.X, found.state.X)
-        added = smooth.covariance[:6, :6] + np.outer(off, off) - found.covariance[:6, :6]
+        found = self.estimate
+        off = difference(fitted.state.X, found.state.X)
+        added = fitted.covariance[:6, :6] + np.outer(off, off) - found.covariance[:6, :6]
         values, vectors = np.linalg.eigh((added + added.T) / 2)
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
+def fit_cell(views: ViewSet, priors: Priors, seed: int, of_class: ArmClass = ARM_CLASSES[UNKNOWN]) -> CellFit:
     """Estimate all unknowns of a cell from views with their board poses.
+
+    of_class: how far an arm may be off of which neither joints nor kinematics are told.
 
     Errors of arm and bracket are among them from `FEWEST_FOR_ARM_ERRORS` views on. Raises BadViewsError or
     DegenerateMotionError where X is not determined, PosesDisagreeError where the noise is beyond its limits.
@@ -119,13 +144,36 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int) -> CellFit:
             observed, found, log_bayes = with_errors(links)
         except (BadViewsError, np.linalg.LinAlgError) as problem:
             failure = str(problem)
+    assumed = None
+    if log_bayes is None or arm is None:
+        try:
+            assumed = _assume_arm(views, observed, plain, priors, of_class)
+        except (BadViewsError, np.linalg.LinAlgError) as problem:
+            failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used))
     require_motion(pairs)  # a wrong view may have been the only one about a second axis
     arm = None if log_bayes is None else arm
     return CellFit(
-        views, turned, observed, priors, found, log_bayes, arm, plain, smooth, pairs, certified, failure,
-        joints_note,
+        views, turned, observed, priors, found, log_bayes, arm, plain, smooth, assumed, pairs, certified,
+        failure, joints_note, of_class,
     )  # fmt: skip
+
+
+def _assume_arm(
+    views: ViewSet, observed: Observations, plain: Estimate, priors: Priors, of_class: ArmClass
+) -> AssumedArm | None:
+    """Fit the errors of a typical arm of this class; None where none reaches the flanges of the used views."""
+    places = np.flatnonzero(plain.used)
+    arm = assumed_postures(views.base_from_flange[places])
+    if arm is None:
+        return None
+    by_links = arm.chain.by_links(arm.joints_rad)
+    by_arm = np.zeros((len(views), *by_links.shape[1:]))
+    by_arm[places] = by_links
+    flex = flex_motion(views.base_from_flange)
+    seen = replace(observed, by_arm_errors=np.concatenate([by_arm, flex], axis=2))
+    found, _ = estimate_with_arm_errors(seen, plain, priors, link_sizes(arm, of_class))
+    return AssumedArm(arm, places, seen, found)
 
 
 def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:

@@ -31,7 +31,6 @@ from calibrate.handeye.metrics import (
     median_distance_m,
     observe,
     picture_coverage,
-    point_error_m,
     score_holdout,
 )
 from calibrate.handeye.noise_scales import MeasurementNoise
@@ -47,6 +46,7 @@ from calibrate.handeye.solution import (
     board_frames,
     camera_frames,
 )
+from calibrate.handeye.stated_point import state_point
 from calibrate.results import (
     Arm,
     ArmErrorValue,
@@ -82,7 +82,7 @@ def _fitted_cell(fit: CellFit, options: SolveOptions, stated: Array, distance_m:
     return FittedCell(
         mount=mount,
         parent_from_child=Transform(*camera_frames(mount), state.X),
-        covariance=found.covariance[:6, :6] + (stated + fit.unknown_arm),
+        covariance=found.covariance[:6, :6] + _of_arm(fit, stated),
         confidence_threshold=found.threshold,
         board_place=Transform(*board_frames(mount), state.Y),
         camera=state.camera,
@@ -104,13 +104,13 @@ def _judgement(
     distance_m: float,
 ) -> Judgement:
     seen = fit.observed.has_pixels
+    figures = _figures(fit, options, cell, stated, distance_m)
     return Judgement(
-        figures=_figures(fit, options, cell, stated, distance_m),
+        figures=figures,
         observability=observe(fit.pairs, cell.covariance, distance_m, cell.parent_from_child.parent),
         coverage=picture_coverage(evidence.kept, cell.camera),
         lens_finding=judge_lens(fit, distance_m) if seen and not cell.lens_estimated else None,
         board_finding=judge_board(fit, distance_m) if seen else None,
-        without_arm=fit.arm is None and not stated.any(),
     )
 
 
@@ -120,16 +120,20 @@ def _figures(
     used = fit.estimate.used
     flanges = mount_poses(fit.views.base_from_flange, fit.views.mount)
     spread_m, spread_rad = board_spread(flanges[used], fit.estimate.board_poses[used], cell.X)
+    corrected = None if cell.arm is None else cell.arm.result
+    corrected_mm = corrected.with_table_mm if corrected is not None and corrected.offered else None
+    point = state_point(fit, cell.installed[0], _of_told(fit, stated), distance_m, corrected_mm)
     return QualityFigures(
         certificate=_certificate(fit, cell.X),
         holdout=_holdout(fit) if options.holdout else None,
         rms_px=_rms_px(fit),
         board_spread_mm=1e3 * spread_m,
         board_spread_deg=float(np.degrees(spread_rad)),
-        predicted_error_mm=1e3 * _predicted_error_m(cell, distance_m),
+        predicted_error_mm=point.error_mm,
         working_distance_m=distance_m,
-        error_shares=error_shares(fit, stated + fit.unknown_arm),
+        error_shares=error_shares(fit, _of_arm(fit, stated)),
         cross_validation=cross_validate(fit, options.seed) if options.folds else None,
+        point=point,
     )
 
 
@@ -174,12 +178,6 @@ def _certificate(fit: CellFit, X: Array) -> Certificate:
     return replace(proven.certificate, distance_sigma=distance_in_sigmas(proven.X, X, own_covariance))
 
 
-def _predicted_error_m(cell: FittedCell, distance_m: float) -> float:
-    """Predict the error of a point at this distance by the X that is installed."""
-    as_it_is = None if cell.arm is None else cell.arm.installed
-    return point_error_m(cell.X, cell.covariance, distance_m) if as_it_is is None else as_it_is.error_m
-
-
 def _stated_error(fit: CellFit, options: SolveOptions) -> Array:
     """Compute the covariance (6, 6) of X by the stated error of the robot, which no number of views lowers.
 
@@ -196,6 +194,16 @@ def _stated_error(fit: CellFit, options: SolveOptions) -> Array:
     J = np.eye(6)
     J[:3, 3:] = -skew(fit.estimate.state.X[:3, 3] - pivot)
     return np.asarray(J * np.repeat([metres, radians], 3) ** 2 @ J.T)
+
+
+def _of_arm(fit: CellFit, stated: Array) -> Array:
+    """Compute the covariance (6, 6) of X by errors of the arm that its links do not explain."""
+    return _of_told(fit, stated) + fit.unknown_arm
+
+
+def _of_told(fit: CellFit, stated: Array) -> Array:
+    """Return `stated`; zero where a typical arm of this accuracy was fitted in its place."""
+    return stated if fit.assumed is None else np.zeros((6, 6))
 
 
 def _rms_px(fit: CellFit) -> float | None:

@@ -253,8 +253,6 @@ class Judgement:
     lens_finding: Finding | None = None
     """None where no lens was given."""
     board_finding: Finding | None = None
-    without_arm: bool = False
-    """Of the arm's own error only the smooth part is stated: no model, joints or accuracy are known."""
     on_box: tuple[str, ...] = ()
     """Paper profile: components of X that lie on the box of equation 22."""
     warnings: tuple[Remark, ...] = ()

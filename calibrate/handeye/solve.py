@@ -10,7 +10,9 @@ Where to find what, in the order of a solve; docs/contributor/solver.md has the 
           linear.py     `Linear`: the likelihood at one state, board poses eliminated: step and noise
                         (`reprojection.py`, `corner_modes.py`, `mixture.py`, `noise_scales.py`, `priors.py`)
         arm_fit.py    the same with errors of arm and bracket (`arm.py`), averaged over their sizes
+        assumed_arm.py  a typical arm of its class, where nobody told the joints
       describe.py   the three parts of the answer (`solution.py`)
+        stated_point.py, placed_point.py   the error of a point as the arm will place it
       readings.py   where the views disagree: the recording as it might be meant, by `fit_poses`
       diagnosis.py, metrics.py, uncertainty.py, arm_result.py, workspace.py    how good it is, and why
       posterior.py  what later checks begin with
@@ -26,6 +28,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
+from calibrate.handeye.assumed_arm import class_of_arm
 from calibrate.handeye.blas_threads import one_blas_thread
 from calibrate.handeye.board_motion import board_extent_m, boards_own_motion
 from calibrate.handeye.cell_fit import CellFit, fit_cell
@@ -76,8 +79,9 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     priors = _priors(views, options)
     focal_sigma = float(min(priors.lens.sigma[0] / priors.lens.mean[0], _FREE_FOCAL))
     poses = pose_views(views, focal_sigma, priors.board.square)
+    of_class = class_of_arm(views, options.arm_class, options.robot_accuracy_m, options.robot_accuracy_rad)
     try:
-        fit = fit_cell(views, priors, options.seed)
+        fit = fit_cell(views, priors, options.seed, of_class)
     except PosesDisagreeError as problem:
         session = explain_recording(
             poses, options.seed, unmirrored=options.unmirrored, pictured=_with_told_lens(views, options)

@@ -27,7 +27,7 @@ def sample_workspace(model: RobotModel, like_rad: Array, count: int = 400) -> Ar
     Positions are uniform in a shell about the shoulder, orientations uniform. Deterministic.
     """
     rng = np.random.default_rng(0)
-    published = MODELS[model.name]
+    published = MODELS.get(model.name, model)
     reach, found = abs(published.a_m[1]) + abs(published.a_m[2]), np.zeros((0, 6))
     branch = _branch(published, like_rad)
     while len(found) < count:

@@ -27,8 +27,9 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from calibrate.arms.classes import ARM_CLASSES, UNKNOWN
 from calibrate.handeye.solution import Judgement, Reading, Solution
-from calibrate.results import Gate, Sense
+from calibrate.results import Gate, PointError, Sense
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -44,8 +45,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     session: bool | None = True
     """Another reading of the whole recording (inverted poses, other square size …) explains it better."""
     arm: Literal["warn", "fail"] | None = "warn"
-    """`fail`: the stated error lacks what an arm does unsmoothly, as no joints, model or accuracy are
-    known."""
+    """`fail`: the size of the arm's own error is assumed by its class, as no joints, kinematics or accuracy
+    are known."""
     rotation_deg: float | None = 30.0
     """No two views are rotated this far against each other."""
     axis_spread: float | None = 0.1
@@ -83,7 +84,7 @@ def judge(
     limits = limits or GateLimits()
     found = [_session_gate(solution.judgement)] if limits.session and solution.profile == "robust" else []
     if limits.arm and solution.profile == "robust":
-        found.append(_arm_gate(solution.judgement.without_arm, limits.arm))
+        found.append(_arm_gate(solution.judgement.figures.point, limits.arm))
     for name, value, title, sense, unit, remedy in _measured(solution, clock_bound_s):
         limit = getattr(limits, name)
         if value is not None and limit is not None:
@@ -170,11 +171,17 @@ def _measured(solution: Solution, clock_bound_s: float | None) -> Iterator[_Figu
         yield _Figure("robot_error_deg", noise_deg, "Orientation noise", "≤", "deg", _ARM)
 
 
-def _arm_gate(without: bool, limit: Literal["warn", "fail"]) -> Gate:
-    if not without:
-        return Gate("arm", True, None, None, "Arm's own error: in the predicted error PASS")
-    remedy = "Record joints, or state --robot-accuracy-mm."
-    text = f"Arm's own error: only in part in the predicted error {limit.upper()}. {remedy}"
+def _arm_gate(point: PointError | None, limit: Literal["warn", "fail"]) -> Gate:
+    if point is None or point.arm != "assumed":
+        known = "" if point is None else f", {point.arm}"
+        return Gate("arm", True, None, None, f"Arm's own error: in the predicted error{known} PASS")
+    of_class = ARM_CLASSES[point.arm_class].title
+    remedy = (
+        "Record joints, or state --robot-accuracy-mm."
+        if point.arm_class != UNKNOWN
+        else "Record joints, or tell the arm: robot.model, --arm-class or --robot-accuracy-mm."
+    )
+    text = f"Arm's own error: assumed as of {of_class}, {limit.upper()}. {remedy}"
     return Gate("arm", limit == "warn", None, None, text, remedy=remedy)
 
 

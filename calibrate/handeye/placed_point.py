@@ -1,0 +1,161 @@
+"""The error of a point as the arm will place it: what a person expects of "right to ± 0.4 mm".
+
+A picture is taken at posture a and the tool is sent to the point at posture b. F is base_from_flange as the
+controller tells it, F* as it is, X̂ the camera pose that is installed, X the true one, p the point in the
+camera, on its axis at the working distance. Where the tool ends, less where the point is:
+
+    eye-in-hand    e = F*(b) F(b)⁻¹ F(a) X̂ p - F*(a) X p
+    eye-to-hand    e = F*(b) F(b)⁻¹ X̂ p - X p
+
+With F* = perturb(F, δ), and δ(q) = B(q) ε + noise of the arm's errors ε, e is linear in small errors:
+e = J(a) (X̂ - X) + L(b) δ(b) - L(a) δ(a), the last term eye-in-hand only. J moves the point by X, and
+L(q) = [1, -[w - t(q)]×] moves what stands at the place w of the point with the flange at t(q).
+
+All in metres, radians and base; the root of the mean of |e|² over a, b and what is uncertain is stated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recordings.geometry import Array, difference, skew
+from recordings.schema.messages import Mount
+
+MOST_POSTURES = 40
+"""Most postures that are paired, evenly spread: their pairs are squared in number."""
+_DRAWS = 400
+"""Draws of what is uncertain, for the distance that holds 95 of 100 points: ± 2 % of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Postures:
+    """Postures at which pictures are taken and points are placed."""
+
+    flange: Array
+    """(n, 4, 4) base_from_flange as the controller tells it."""
+    by_arm: Array
+    """(n, 6, q) motion of the flange, in base, by each error of the arm."""
+    by_bracket: Array
+    """(n, 6, b) motion, in base, of what carries the camera, by a bracket that bends: eye-in-hand it moves the
+    camera against the flange, and no tool. Eye-to-hand it carries the board and has no part in the error."""
+
+    def thinned(self, most: int = MOST_POSTURES) -> Postures:
+        """Keep at most so many, evenly spread."""
+        some = np.unique(np.linspace(0, len(self.flange) - 1, min(len(self.flange), most)).astype(np.intp))
+        return Postures(self.flange[some], self.by_arm[some], self.by_bracket[some])
+
+
+@dataclass(frozen=True, eq=False)
+class KnownErrors:
+    """What a fit knows of X and of the errors of arm and bracket."""
+
+    X: Array
+    """(4, 4) mean of the true X."""
+    errors: Array
+    """(q + b,) means of the errors of arm and bracket."""
+    covariance: Array
+    """(6 + q + b, 6 + q + b) of [X, errors]."""
+    noise: Array
+    """(2,) 1σ per axis of what the arm does differently each time, metres and radians."""
+    freedom: float
+    """Degrees of freedom of the noise's estimate: the fewer, the heavier the tail."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPoint:
+    """The error e of a point, linear in what is uncertain, over pairs of postures."""
+
+    mean: Array
+    """(m, 3) e by the means of X and errors, X̂ installed."""
+    by_unknown: Array
+    """(m, 3, 6 + q + b) by [X, errors] less their means."""
+    by_noise: Array
+    """(m, 3, 12) by the noise of the flange at b, then at a."""
+
+    @classmethod
+    def of(
+        cls, mount: Mount, known: KnownErrors, installed: Array, distance_m: float, postures: Postures
+    ) -> PlacedPoint:
+        """Linearise for pairs of all `postures` (one with itself left out) and X̂ = `installed` (4, 4)."""
+        at = postures.thinned()
+        p = np.array([0.0, 0.0, distance_m])
+        if mount == "eye-in-hand":
+            return _in_hand(at, known, installed, p)
+        return _fixed(at, known, installed, p)
+
+    def mean_square(self, covariance: Array, noise: Array) -> float:
+        """Average |e|², m²; `covariance` and `noise` as in `KnownErrors`."""
+        K = np.einsum("mik,mil->kl", self.by_unknown, self.by_unknown) / len(self.mean)
+        return self.systematic() + float(np.sum(K * covariance)) + self.by_chance(noise)
+
+    def systematic(self) -> float:
+        """Average |e|², m², by the means alone: known, and yet in every point."""
+        return float((self.mean**2).sum(axis=1).mean())
+
+    def by_chance(self, noise: Array) -> float:
+        """Average |e|², m², by the arm's noise alone."""
+        variance = np.tile(np.repeat(noise**2, 3), 2)
+        return float((self.by_noise**2 * variance).sum(axis=(1, 2)).mean())
+
+    def bound_m(self, known: KnownErrors, share: float = 0.95) -> float:
+        """Find the distance that holds this share of all points, by draws. Deterministic."""
+        rng = np.random.default_rng(0)
+        size = known.covariance.shape[0]
+        values, vectors = np.linalg.eigh(known.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        # Student's t: the noise is itself estimated
+        heavier = np.sqrt(known.freedom / rng.chisquare(known.freedom, (_DRAWS, 1)))
+        unknown = (rng.normal(size=(_DRAWS, size)) * heavier) @ root.T
+        sigma = np.tile(np.repeat(known.noise, 3), 2)
+        pairs = rng.integers(len(self.mean), size=(_DRAWS, MOST_POSTURES))
+        noise = sigma * rng.normal(size=(_DRAWS, MOST_POSTURES, 12))
+        e = self.mean[pairs] + np.einsum("dpik,dk->dpi", self.by_unknown[pairs], unknown)
+        e += np.einsum("dpik,dpk->dpi", self.by_noise[pairs], noise)
+        return float(np.quantile(np.linalg.norm(e, axis=2), share))
+
+
+def _in_hand(at: Postures, known: KnownErrors, installed: Array, p: Array) -> PlacedPoint:
+    n = len(at.flange)
+    first, second = np.nonzero(~np.eye(n, dtype=bool)) if n > 1 else (np.zeros(1, int), np.zeros(1, int))
+    R, t = at.flange[:, :3, :3], at.flange[:, :3, 3]
+    seen = t + R @ (installed[:3, :3] @ p + installed[:3, 3])  # (n, 3) the point, by the installed X
+    by_X = R @ _moves_point(known.X, p)
+    placed = _lever(seen[first] - t[second])
+    pictured = _lever(seen[first] - t[first])
+    by_arm = placed @ at.by_arm[second] - pictured @ at.by_arm[first]
+    by_bracket = -pictured @ at.by_bracket[first]
+    by_errors = np.concatenate([by_arm, by_bracket], axis=2)
+    off = by_X @ difference(installed, known.X)
+    return PlacedPoint(
+        mean=off[first] + by_errors @ known.errors,
+        by_unknown=np.concatenate([-by_X[first], by_errors], axis=2),
+        by_noise=np.concatenate([placed, -pictured], axis=2),
+    )
+
+
+def _fixed(at: Postures, known: KnownErrors, installed: Array, p: Array) -> PlacedPoint:
+    n = len(at.flange)
+    t = at.flange[:, :3, 3]
+    seen = installed[:3, :3] @ p + installed[:3, 3]
+    by_X = np.broadcast_to(_moves_point(known.X, p), (n, 3, 6))
+    placed = _lever(seen - t)
+    by_errors = np.concatenate([placed @ at.by_arm, np.zeros((n, 3, at.by_bracket.shape[2]))], axis=2)
+    off = by_X @ difference(installed, known.X)
+    return PlacedPoint(
+        mean=off + by_errors @ known.errors,
+        by_unknown=np.concatenate([-by_X, by_errors], axis=2),
+        by_noise=np.concatenate([placed, np.zeros((n, 3, 6))], axis=2),
+    )
+
+
+def _moves_point(X: Array, p: Array) -> Array:
+    """Make the derivative (3, 6) of X p, in X's parent, by `geometry.perturb`'s delta of X."""
+    return np.concatenate([np.eye(3), -skew(X[:3, :3] @ p)], axis=1)
+
+
+def _lever(away: Array) -> Array:
+    """Make L (n, 3, 6): motion of a point `away` (n, 3) from the flange's origin by that of the flange."""
+    eye = np.broadcast_to(np.eye(3), (*away.shape[:-1], 3, 3))
+    return np.concatenate([eye, -skew(away)], axis=-1)

@@ -64,6 +64,19 @@ class Gate(msgspec.Struct, frozen=True):
         text = f"{title}: {gate.shown(value)} ({sense} {bare}{limit_unit})"
         return msgspec.structs.replace(gate, text=f"{text} PASS" if passed else f"{text} FAIL. {remedy}")
 
+    def as_advice(self, why: str) -> Gate:
+        """Make a warning of a closed gate: it passes with its remedy, and says why it does not fail."""
+        said = self.text.partition(" FAIL")[0]
+        text = f"{said} WARN. {why} {self.remedy}"
+        return msgspec.structs.replace(self, passed=True, text=text)
+
+    @property
+    def over_limit(self) -> bool:
+        """True where the value is on the wrong side of its limit, and a reason lets it pass."""
+        if not self.passed or self.value is None or self.limit is None or self.sense is None:
+            return False
+        return self.value < self.limit if self.sense == "≥" else self.value > self.limit
+
     def shown(self, figure: float | None) -> str:
         """Format a figure of this gate with the unit for people (mm for m, for instance)."""
         factor, suffix = UNITS_SHOWN.get(self.unit, (1.0, ""))

@@ -10,13 +10,17 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from calibrate.arms.classes import ARM_CLASSES
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import Calibration, Override
+from calibrate.files.calibration import Calibration, Override, Quality
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
-from calibrate.results import BoardShape
+from calibrate.results import BoardShape, PointError
 from recordings.geometry import roll_pitch_yaw
 from recordings.schema.messages import BoardSpec, Source
+
+_MOST = 0.8
+"""Share of the error above which it is said that no further view lowers it."""
 
 SOURCE_STAMPS: dict[Source, str] = {
     "real": "",
@@ -40,15 +44,14 @@ class ShownFigure:
 def predicted_error(error_mm: float | None, distance_m: float | None) -> ShownFigure:
     """Make the one figure of accuracy, as every screen and page shows it: 1σ of a point so far away."""
     value = "–" if error_mm is None else f"± {error_mm:.3g} mm (1σ)"
-    return ShownFigure("predicted error", value, f"at {1000 * distance_m:.0f} mm" if distance_m else "")
+    return ShownFigure("placed-point error", value, f"at {1000 * distance_m:.0f} mm" if distance_m else "")
 
 
 def figures(calibration: Calibration) -> dict[str, ShownFigure]:
     """Collect the known figures that a calibration is judged by, most important first; the error always."""
     quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
     error = predicted_error(quality.predicted_error_mm, quality.working_distance_m)
-    without = "the arm's own error only in part" * quality.without_arm
-    shown = {"error": replace(error, about=", ".join(filter(None, (error.about, without))))}
+    shown = {"error": replace(error, about=", ".join(filter(None, (error.about, _about_arm(quality)))))}
     if (held := quality.holdout) is not None:
         missed = f"{1000 * held.e_t_m:.3g} mm, e_R {held.e_R:.3g}"
         shown["held_out"] = ShownFigure("held-out error", missed, f"over {len(held.pairs)} samples")
@@ -61,14 +64,42 @@ def figures(calibration: Calibration) -> dict[str, ShownFigure]:
     return shown
 
 
+def _about_arm(quality: Quality) -> str:
+    """Say what is assumed or left out of the arm's own error; empty where it is known."""
+    if quality.point is None and quality.predicted_error_mm is not None:
+        part = "the arm's own error only in part" if quality.without_arm else "by an earlier rule"
+        return f"X alone, {part}"
+    if quality.point is None or quality.point.arm != "assumed":
+        return ""
+    return f"the arm's own assumed as of {ARM_CLASSES[quality.point.arm_class].title}"
+
+
 def accuracy_text(calibration: Calibration) -> str:
-    """Write how right the result is, and the limit, as a sentence."""
-    quality, value = calibration.quality, figures(calibration)["error"].value
-    without = ", the arm's own error only in part" * quality.without_arm
+    """Write how right a placed point is, what of it is the arm's own, and the limit, in sentences."""
+    quality = calibration.quality
+    point = quality.point
     gates = [gate for gate in quality.gates if gate.name == "predicted_error_m"]
     limit = f" The limit is {gates[0].shown(gates[0].limit)}." if gates else ""
-    point = f"A point {quality.working_distance_m or 0.0:.2f} m from the camera"
-    return f"{point} is right to {value}{without}.{limit}"
+    at = f"{quality.working_distance_m or 0.0:.2f} m"
+    value = figures(calibration)["error"].value
+    about = _about_arm(quality)
+    about = f", {about}" if about else ""
+    if point is None:
+        return f"A point {at} from the camera is right to {value}{about}.{limit}"
+    held = f"95 of 100 points within {point.p95_mm:.2g} mm"
+    told = f"A point {at} from the camera is placed to {value}" if gates else f"Good to {value} at {at}"
+    return f"{told} ({held}){about}.{limit}{_least_text(point)}"
+
+
+def _least_text(point: PointError) -> str:
+    """Say what of the error no calibration lowers, where that is most of it; empty where it is not."""
+    if point.floor_mm < _MOST * point.error_mm:
+        return ""
+    own = f"{point.floor_mm:.2g} of {point.error_mm:.2g} mm no further view lowers"
+    if point.corrected_mm is not None and point.corrected_mm < _MOST * point.error_mm:
+        return f" {own}: use the corrected arm ({point.corrected_mm:.2g} mm)."
+    advice = "record joints" if point.arm == "assumed" else "have the arm calibrated"
+    return f" {own}: {advice}, or record poses where you work."
 
 
 def use_text(calibration: Calibration) -> str:

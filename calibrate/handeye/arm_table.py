@@ -68,8 +68,10 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     covariance: tuple[tuple[float, ...], ...]
     """Of X's [δt, δφ] and of the errors of the arm's links, as in `quality.arm.table`; metres, radians."""
     with_table_mm: float
-    """Error of a point at the working distance as the corrected arm places it (`quality.point`). In files
-    without `quality.point`: averaged over the workspace, where a motion of all points together is no error."""
+    """Error of a point at the working distance as the corrected arm places it (`quality.point`).
+
+    In files without `quality.point`: averaged over the workspace, where a motion of all points together is no
+    error."""
     without_table_mm: float
     """The same for the arm as it is, with the X that suits it."""
     nominal: DhTable | None = None

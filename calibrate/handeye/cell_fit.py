@@ -68,7 +68,7 @@ class CellFit:
     smooth: Estimate | None
     """The estimate for flanges that err smoothly, whatever the joints say; None where not modelled."""
     assumed: AssumedArm | None
-    """The estimate for an arm of this class; None where `arm` is known, or no typical arm reaches the views."""
+    """The estimate for a typical arm; None where `arm` is known, or no typical arm reaches the views."""
     pairs: Pairs
     """Pairs of the views that count."""
     certified: GlobalResult
@@ -162,7 +162,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, of_class: ArmClass = ARM
 def _assume_arm(
     views: ViewSet, observed: Observations, plain: Estimate, priors: Priors, of_class: ArmClass
 ) -> AssumedArm | None:
-    """Fit the errors of a typical arm of this class; None where none reaches the flanges of the used views."""
+    """Fit the errors of a typical arm of this class; None where none reaches the used views."""
     places = np.flatnonzero(plain.used)
     arm = assumed_postures(views.base_from_flange[places])
     if arm is None:

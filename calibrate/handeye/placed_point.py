@@ -38,8 +38,8 @@ class Postures:
     by_arm: Array
     """(n, 6, q) motion of the flange, in base, by each error of the arm."""
     by_bracket: Array
-    """(n, 6, b) motion, in base, of what carries the camera, by a bracket that bends: eye-in-hand it moves the
-    camera against the flange, and no tool. Eye-to-hand it carries the board and has no part in the error."""
+    """(n, 6, b) motion, in base, of what a bending bracket carries: eye-in-hand the camera, and no tool;
+    eye-to-hand the board, which has no part in the error."""
 
     def thinned(self, most: int = MOST_POSTURES) -> Postures:
         """Keep at most so many, evenly spread."""

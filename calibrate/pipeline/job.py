@@ -188,7 +188,8 @@ def solve_recording(
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
     solution = solve_views(views, solver_options(options, prepared))
-    gates = judge(solution, options.limits, _clock_bound_s(recording, solution))
+    of_station = recording.info.source != "imported"
+    gates = judge(solution, options.limits, _clock_bound_s(recording, solution), of_station)
     calibration = make_calibration(
         recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen
     )

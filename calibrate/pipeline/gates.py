@@ -34,24 +34,27 @@ from calibrate.results import Gate, PointError, Sense
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Limits of the gates, by their ids, as written in a limits file; None switches a gate off.
+    """Limits of the gates, by their ids, as written in a limits file; None (null) switches a gate off, or
+    leaves it a warning.
 
     The text below a limit says when its gate closes.
     """
 
     views: int | None = 8
     """Fewer views were used."""
-    weight: float | None = 0.8
-    """The mean weight of the views is smaller: too many were rejected or count for little."""
+    weight: float | None = None
+    """The mean weight of the views is smaller: too many were rejected or count for little. Not stated: a
+    warning below 80 %."""
     session: bool | None = True
     """Another reading of the whole recording (inverted poses, other square size …) explains it better."""
     arm: Literal["warn", "fail"] | None = "warn"
     """`fail`: the size of the arm's own error is assumed by its class, as no joints, kinematics or accuracy
     are known."""
-    rotation_deg: float | None = 30.0
-    """No two views are rotated this far against each other."""
-    axis_spread: float | None = 0.1
-    """All rotations are about nearly one axis (0: all about one, 1: all axes alike)."""
+    rotation_deg: float | None = None
+    """No two views are rotated this far against each other. Not stated: a warning below 30°."""
+    axis_spread: float | None = None
+    """All rotations are about nearly one axis (0: all about one, 1: all axes alike). Not stated: a warning
+    below 0.1."""
     view_rms_px: float | None = 1.5
     """The rms reprojection error of some view is larger."""
     holdout_share: float | None = 0.01
@@ -61,8 +64,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     predicted_error_m: float | None = None
     """A point at the working distance is placed with a larger error (1σ). Not stated: 2 mm for a recording of
     the station, whose cell is to be used; nothing fails by size where nobody asked for one."""
-    coverage: float | None = 0.25
-    """The intrinsics were estimated here, and all boards together cover a smaller share of the image."""
+    coverage: float | None = None
+    """The intrinsics were estimated here, and all boards together cover a smaller share of the image. Not
+    stated: a warning below 25 %."""
     lens_pull: float | None = 1.0
     """Given intrinsics shift X, beyond their tolerance, by more than its error without an arm's."""
     board_pull: float | None = 1.0
@@ -99,11 +103,12 @@ def judge(
         found.append(_arm_gate(solution.judgement.figures.point, limits.arm))
     point = solution.judgement.figures.point
     for name, value, title, sense, unit, remedy in _measured(solution, clock_bound_s):
-        limit = getattr(limits, name)
+        stated = getattr(limits, name)
+        limit = ADVICE.get(name) if stated is None else stated
         if value is None or limit is None:
             continue
         gate = Gate.measured(name, title, value, sense, limit, unit, remedy)
-        if not gate.passed and name in ADVICE and point is not None:
+        if not gate.passed and stated is None and point is not None:
             gate = gate.as_advice(_cost(name, point))
         if not gate.passed and name == "predicted_error_m" and _by_assumption_alone(point, limit):
             gate = gate.as_advice(_ASSUMED)
@@ -111,8 +116,9 @@ def judge(
     return tuple(found)
 
 
-ADVICE = ("weight", "rotation_deg", "axis_spread", "coverage")
-"""Gates that warn and never fail: the stated error holds already what they miss."""
+ADVICE = {"weight": 0.8, "rotation_deg": 30.0, "axis_spread": 0.1, "coverage": 0.25}
+"""Gates that warn at these values where nobody states a limit: the stated error holds already what they
+miss."""
 _ASSUMED = (
     "It is larger only by the arm's own error, whose size is assumed. Record joints, or have it measured."
 )

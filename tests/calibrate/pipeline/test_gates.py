@@ -14,13 +14,24 @@ from calibrate.errors import UsageError
 from calibrate.files.formatting import figures
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solution import Explanation, Finding, Reading, Solution
-from calibrate.pipeline.gates import GateLimits, judge
+from calibrate.pipeline.gates import ADVICE, GateLimits, judge
 from calibrate.pipeline.job import SolvedRecording
-from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark, ViewQuality, ViewWeight
+from calibrate.results import (
+    CrossValidation,
+    Gate,
+    HoldoutScore,
+    PointError,
+    Remark,
+    ViewQuality,
+    ViewWeight,
+)
 from tests.codes import raises
 
 CLOCK_S = 0.001
-DEFAULTS = {name: limit for name, limit in msgspec.structs.asdict(GateLimits()).items() if limit is not None}
+STATED = GateLimits(arm="fail", predicted_error_m=0.002, **ADVICE)
+NAMES = [name for name, limit in msgspec.structs.asdict(STATED).items() if limit is not None]
+POINT = PointError(0.5, 0.5, 1.0, 0.6, 0.1, 0.45, 0.2, 0.45, 0.49, "learned")
+ASSUMED = msgspec.structs.replace(POINT, arm="assumed", arm_class="universal-robots")
 
 
 def altered(
@@ -62,6 +73,7 @@ def solution(solved_real: SolvedRecording) -> Solution:
             "cross_validation": CrossValidation(0.5, 0.06, 0.4, 5, 1.5),
             "predicted_error_mm": 0.5,
             "working_distance_m": 0.5,
+            "point": POINT,
         },
         judgement={
             "coverage": 0.6,
@@ -80,9 +92,9 @@ def failed(gates: tuple[Gate, ...]) -> list[str]:
 
 
 def test_a_good_solution_passes_every_gate(solution: Solution) -> None:
-    gates = judge(solution, None, CLOCK_S)
+    gates = judge(solution, STATED, CLOCK_S)
     assert failed(gates) == []
-    assert sorted(gate.name for gate in gates) == sorted(DEFAULTS), "a gate's id is the name of its limit"
+    assert sorted(gate.name for gate in gates) == sorted(NAMES), "a gate's id is the name of its limit"
 
 
 def spoiled(solution: Solution, name: str) -> tuple[Solution, float]:
@@ -93,7 +105,7 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, float]:
     pull = Finding(8.0, 0.0011, 0.0005)
     changed = {
         "views": altered(solution, views={"used": solution.evidence.views.used[:5]}),
-        "arm": altered(solution, judgement={"without_arm": True}),
+        "arm": altered(solution, figures={"point": ASSUMED}),
         "rotation_deg": altered(solution, judgement={"observability": replace(seen, largest_angle_rad=0.2)}),
         "axis_spread": altered(solution, judgement={"observability": replace(seen, axis_spread=0.01)}),
         "session": altered(
@@ -118,14 +130,48 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, float]:
     return changed.get(name, solution), 0.05 if name == "clock_bound_s" else CLOCK_S
 
 
-@pytest.mark.parametrize("name", DEFAULTS)
+@pytest.mark.parametrize("name", NAMES)
 def test_each_gate_closes_alone_and_says_why(solution: Solution, name: str) -> None:
     bad, clock_s = spoiled(solution, name)
-    gates = judge(bad, GateLimits(arm="fail"), clock_s)
+    gates = judge(bad, STATED, clock_s)
     assert failed(gates) == [name]
     gate = next(gate for gate in gates if gate.name == name)
     assert gate.remedy and gate.text.endswith(f"FAIL. {gate.remedy}")
     assert all(gate.text.endswith("PASS") and not gate.remedy for gate in gates if gate.name != name)
+
+
+@pytest.mark.parametrize("name", ADVICE)
+def test_what_the_stated_error_holds_already_warns_where_nobody_stated_a_limit(
+    solution: Solution, name: str
+) -> None:
+    gates = judge(spoiled(solution, name)[0], None, CLOCK_S)
+    assert failed(gates) == []
+    (gate,) = (gate for gate in gates if gate.remedy)
+    assert (gate.name, gate.narrow, gate.over_limit) == (name, True, True)
+
+
+def test_nothing_fails_by_a_size_that_nobody_asked_for(solution: Solution) -> None:
+    large, _ = spoiled(solution, "predicted_error_m")
+    assert failed(judge(large, None, CLOCK_S)) == []
+    assert failed(judge(large, None, CLOCK_S, of_station=True)) == ["predicted_error_m"]
+    assert failed(judge(large, GateLimits(predicted_error_m=0.004), CLOCK_S, of_station=True)) == []
+
+
+@pytest.mark.parametrize(
+    ("arm", "from_x_mm", "closed"), [("assumed", 0.5, False), ("assumed", 2.5, True), ("learned", 0.5, True)]
+)
+def test_an_error_too_large_by_an_assumed_arm_alone_passes_with_that_reason(
+    solution: Solution, solved_real: SolvedRecording, arm: str, from_x_mm: float, closed: bool
+) -> None:
+    large = msgspec.structs.replace(
+        ASSUMED, error_mm=3.0, arm=arm, from_x_mm=from_x_mm, from_arm_mm=float(np.sqrt(9 - from_x_mm**2))
+    )
+    judged = altered(solution, figures={"point": large, "predicted_error_mm": large.error_mm})
+    gates = judge(judged, GateLimits(predicted_error_m=0.002), CLOCK_S)
+    assert failed(gates) == ["predicted_error_m"] * closed
+    quality = msgspec.structs.replace(solved_real.calibration.quality, gates=list(gates))
+    made = msgspec.structs.replace(solved_real.calibration, quality=quality)
+    assert made.verdict == ("FAIL" if closed else "PASS WITH A REASON")
 
 
 def test_values_and_limits_are_in_the_units_of_the_file_of_limits(solution: Solution) -> None:
@@ -178,7 +224,7 @@ def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution
     bad, _ = spoiled(solution, "view_rms_px")
     assert failed(judge(bad, limits, CLOCK_S)) == []
     assert limits.views == 3
-    assert limits.rotation_deg == GateLimits().rotation_deg
+    assert limits.axis_spread == GateLimits().axis_spread
 
 
 @pytest.mark.parametrize("content", ["view: 3\n", "views: many\n", "views: [", "views: 3\nviews: 4\n"])
@@ -191,24 +237,25 @@ def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) ->
         read_limits(tmp_path / "none.yaml")
 
 
-def test_an_error_without_the_arm_s_own_is_a_warning_unless_the_integrator_says_more(
+def test_an_arm_whose_errors_are_assumed_is_a_warning_unless_the_integrator_says_more(
     solution: Solution,
 ) -> None:
-    gates = judge(altered(solution, judgement={"without_arm": True}), None, CLOCK_S)
+    gates = judge(altered(solution, figures={"point": ASSUMED}), None, CLOCK_S)
     assert failed(gates) == []
     assert [gate.name for gate in gates if gate.remedy] == ["arm"]
     assert all(gate.narrow for gate in gates if gate.remedy)
 
 
-def test_the_predicted_error_says_whether_the_arm_s_own_is_in_it(solved_real: SolvedRecording) -> None:
+def test_the_error_says_whether_the_arm_s_own_is_known_assumed_or_left_out(
+    solved_real: SolvedRecording,
+) -> None:
     made = solved_real.calibration
 
-    def about(remedy: str) -> str:
-        gate = Gate("arm", True, None, None, "Arm's own error", remedy=remedy)
-        told = msgspec.structs.replace(made, quality=msgspec.structs.replace(made.quality, gates=[gate]))
-        return figures(told)["error"].about
+    def about(point: PointError | None) -> str:
+        quality = msgspec.structs.replace(made.quality, point=point)
+        return figures(msgspec.structs.replace(made, quality=quality))["error"].about
 
-    assert about("Record joints.") != about("")
+    assert len({about(POINT), about(ASSUMED), about(None)}) == 3
 
 
 def test_the_pose_to_retake_is_numbered_as_on_the_screen(solution: Solution) -> None:

@@ -38,6 +38,9 @@ OCTAVES = 1.0
 laboratories state of one class differs by a factor of about two."""
 _ROUNDS = 3
 """Rounds of `Linear.solve` for each combination: few, as it starts with the noise found for a neighbour."""
+_START = -2.5
+"""Log probability, against the likeliest, from which alike sizes are a start: within about two octaves of
+what is expected."""
 _LEAST = float(np.log(1e-2))
 """Log probability, against the likeliest, below which a combination of sizes is left out."""
 
@@ -68,8 +71,13 @@ class _Sizes:
 
     @property
     def alike(self) -> list[Sizes]:
-        """Combinations of shifts as large, in mm, as turns in mrad, and a rigid bracket."""
-        return [(size, size, 0) for size in range(self.shape[0])]
+        """Combinations of shifts as large, in mm, as turns in mrad, and a rigid bracket.
+
+        Those that what is expected of the arm makes unlikely are left to `_explore`.
+        """
+        chance = np.array([self.log_chance((size, size, 0)) for size in range(self.shape[0])])
+        likely = np.flatnonzero(chance > chance.max() + _START)
+        return [(int(size), int(size), 0) for size in likely]
 
     def sigma(self, one: Sizes) -> Array:
         """1σ (q,) of each error, mm and mrad."""

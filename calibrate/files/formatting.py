@@ -252,11 +252,10 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
     if arm is None or arm.refused == "no-evidence":
         return
     distance_mm = 1e3 * (calibration.quality.working_distance_m or 0.0)
-    point = f"a point {distance_mm:.0f} mm ahead" if calibration.mount == "eye-in-hand" else "the tool"
     learned = arm.learned is not None
     yield (
-        f"Over the {'range of the joints' if learned else 'workspace'} {point} is placed to "
-        f"{arm.with_table_mm:.2f} mm (1σ) by the corrected arm, to {arm.without_table_mm:.2f} mm as it is."
+        f"A point {distance_mm:.0f} mm from the camera is placed to {arm.with_table_mm:.2f} mm (1σ) by the "
+        f"corrected arm, to {arm.without_table_mm:.2f} mm as it is."
     )
     if (seen := arm.held_out) is not None:
         yield (

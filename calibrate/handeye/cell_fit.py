@@ -134,7 +134,10 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, of_class: ArmClass = ARM
 
         def with_errors(by_arm: Array) -> tuple[Observations, Estimate, float | None]:
             seen = replace(observed, by_arm_errors=np.concatenate([by_arm, flex], axis=2))
-            return seen, *estimate_with_arm_errors(seen, plain, priors)
+            fitted, evidence = estimate_with_arm_errors(seen, plain, priors)
+            if fitted.used.sum() < FEWEST_USED:
+                raise np.linalg.LinAlgError("with them nearly every view is rejected")
+            return seen, fitted, evidence
 
         try:
             _, smooth, _ = with_errors(smoothly)

@@ -27,6 +27,7 @@ from recordings.geometry import (
     inverse,
     matrix_from_quaternion,
     quaternion_from_matrix,
+    rotation_angle,
     rotation_exp,
     rotation_log,
 )
@@ -142,6 +143,11 @@ def _only_positions(fit: PoseFit) -> bool:
     return bool(radians < _SOUND_RAD and metres > _FAR_M and (fit.full > 0.5).mean() > 0.5)
 
 
+_OTHER_BASE_RAD = float(np.radians(10.0))
+"""Least turn between two bases. Frames that are taken for each other are an eighth of a turn or more apart;
+the errors of a low-cost arm's links turn its positions by a few degrees."""
+
+
 def _of_other_base(views: PoseViews, as_recorded: PoseFit | None, seed: int) -> list[Explanation]:
     """Read the positions in a base that is turned against that of the orientations, by least squares."""
     if as_recorded is None:
@@ -158,8 +164,11 @@ def _of_other_base(views: PoseViews, as_recorded: PoseFit | None, seed: int) -> 
     U, stretch, Vt = np.linalg.svd(Q)
     if np.linalg.det(Q) <= 0 or stretch.max() > 2 or stretch.min() < 0.5:
         return []
+    turn = U @ Vt
+    if rotation_angle(turn) < _OTHER_BASE_RAD:
+        return []
     flange = views.flange.copy()
-    flange[:, :3, 3] = t @ (U @ Vt).T
+    flange[:, :3, 3] = t @ turn.T
     fit = _fit(replace(views, flange=flange), seed)
     if fit is None:
         return []

@@ -68,8 +68,10 @@ def test_the_table_with_its_own_x_is_best_at_new_poses(worn: Worn, solved: Solut
     uncorrected = spread(nominal, as_it_is(solved).X, worn.new_board_poses)
     assert both < 0.6 * uncorrected
     assert table.with_table_mm < 0.7 * table.without_table_mm
-    stated_mm = solved.judgement.figures.predicted_error_mm
-    assert stated_mm == 1e3 * as_it_is(solved).error_m, "that of the X which is installed"
+    figures = solved.judgement.figures
+    assert figures.predicted_error_mm == figures.point.error_mm
+    assert figures.point.error_mm == pytest.approx(table.without_table_mm), "by the X that is installed"
+    assert figures.point.corrected_mm == table.with_table_mm
     told = Solved(worn.views, solved, ())
     np.testing.assert_array_equal(told.X, as_it_is(solved).X)
     np.testing.assert_array_equal(told.covariance(), as_it_is(solved).covariance)

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from calibrate.handeye.blas_threads import one_blas_thread
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
-from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.noise_scales import MeasurementNoise
+from calibrate.handeye.placed_point import PointPrediction
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.results import SHAPE
 from calibrate.views.arrays import array_of
@@ -115,6 +115,22 @@ def covariance_of(information: Array, prior: Array | None = None) -> Array:
     return np.asarray(np.linalg.inv(scaled) * scale[..., :, None] * scale[..., None, :])
 
 
-def predicted_error_m(information: Array, prior: Array, X: Array, distance_m: float) -> float:
-    """Predict the error of a point as `point_error_m`, from information (p, p) and its prior."""
-    return point_error_m(X, covariance_of(information, prior)[:6, :6], distance_m)
+MORE_VIEWS = 10
+"""Views more that are asked what they would lower."""
+
+
+def predicted_error_m(information: Array, prior: Array, point: PointPrediction) -> float:
+    """Predict the error of a placed point, metres, from information (p, p) and its prior.
+
+    The errors of the arm that `point` models are the last in the order of the parameters.
+    """
+    covariance = covariance_of(information, prior)
+    count = len(covariance)
+    errors = point.point.by_unknown.shape[2] - 6
+    places = np.append(np.arange(6), np.arange(count - errors, count))
+    return point.error_m(covariance[np.ix_(places, places)])
+
+
+def with_more_views_m(information: Array, prior: Array, point: PointPrediction, views: float) -> float:
+    """Predict as `predicted_error_m` what `MORE_VIEWS` more of the kind of these `views` would leave."""
+    return predicted_error_m(information * (1.0 + MORE_VIEWS / max(views, 1.0)), prior, point)

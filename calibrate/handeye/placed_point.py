@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibrate.handeye.noise_scales import MeasurementNoise
 from recordings.geometry import Array, difference, skew
 from recordings.schema.messages import Mount
 
@@ -114,6 +115,53 @@ class PlacedPoint:
         e = self.mean[pairs] + np.einsum("dpik,dk->dpi", self.by_unknown[pairs], unknown)
         e += np.einsum("dpik,dpk->dpi", self.by_noise[pairs], noise)
         return float(np.quantile(np.linalg.norm(e, axis=2), share))
+
+
+@dataclass(frozen=True, eq=False)
+class PointPrediction:
+    """The error of a placed point by what views tell so far: while capturing, and for a plan.
+
+    The mean of e is zero: X̂ is the best X, and errors of the arm that are modelled are corrected by their
+    best. Of e as the module's text has it, E|e|² = trace(K C) + E|L(b) δ(b) - L(a) δ(a)|²: C is the covariance
+    of [X, errors], K the mean, over pairs of postures, of Jᵀ J, and δ the arm's noise alone, independent at
+    both postures. Where no errors of the arm are modelled, a noise that was fitted to views holds the part of
+    them that varies from view to view; the part that all views share is not seen.
+    """
+
+    point: PlacedPoint
+    noise: Array
+    """(2,) of the arm, as in `KnownErrors`."""
+
+    @classmethod
+    def of(
+        cls,
+        mount: Mount,
+        X: Array,
+        base_from_flange: Array,
+        distance_m: float,
+        noise: MeasurementNoise,
+        by_arm_errors: Array | None = None,
+    ) -> PointPrediction:
+        """Linearise at X (4, 4) for postures (n, 4, 4), a point `distance_m` ahead of the camera.
+
+        by_arm_errors: (n, 6, q) motion of the flange by errors that are modelled; None: none are.
+        """
+        n = len(base_from_flange)
+        none = np.zeros((n, 6, 0))
+        postures = Postures(base_from_flange, none if by_arm_errors is None else by_arm_errors, none)
+        count = postures.by_arm.shape[2]
+        robot = np.array([noise.robot_m, noise.robot_rad])
+        exact = KnownErrors(X, np.zeros(count), np.zeros((6 + count, 6 + count)), robot, 1.0)
+        return cls(PlacedPoint.of(mount, exact, X, distance_m, postures), robot)
+
+    def error_m(self, covariance: Array) -> float:
+        """Compute the rms of |e|, metres. covariance: (6 + q, 6 + q) of [X, errors of the arm]."""
+        return float(np.sqrt(self.point.mean_square(covariance, self.noise)))
+
+    @property
+    def floor_m(self) -> float:
+        """Root mean square of |e| by the arm's noise alone, metres: no view lowers it."""
+        return float(np.sqrt(self.point.by_chance(self.noise)))
 
 
 def _in_hand(at: Postures, known: KnownErrors, installed: Array, p: Array) -> PlacedPoint:

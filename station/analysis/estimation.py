@@ -14,13 +14,21 @@ import numpy as np
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.handeye.information import covariance_of, prior_information, view_information
-from calibrate.handeye.metrics import median_distance_m, point_error_m
+from calibrate.handeye.information import (
+    covariance_of,
+    predicted_error_m,
+    prior_information,
+    view_information,
+    with_more_views_m,
+)
+from calibrate.handeye.metrics import median_distance_m
 from calibrate.handeye.noise_scales import MeasurementNoise
+from calibrate.handeye.placed_point import PointPrediction
 from calibrate.handeye.pose_fit import PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
+from calibrate.pipeline.gates import STATION_ERROR_M, GateLimits
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.errors import RecordingError
 from recordings.files import MAIN_CAMERA
@@ -29,6 +37,7 @@ from recordings.images import viewable
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.cell.config import StationConfig, matrix4
+from station.cell.layout import board_place
 from station.cell.status import EstimateStatus
 from station.plan.visibility import count_in_parts
 
@@ -58,19 +67,98 @@ def running_estimate(
         return blank
     try:
         quick = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
-        covariance = quick_covariance(quick, config.board, not lens_is_known)
+        error = quick_error(quick, config.board, not lens_is_known)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return blank
-    distance_m = median_distance_m(quick.views.camera_from_board)
-    error_m = point_error_m(quick.X, covariance, distance_m)
+    joints_known = all(view.joints_rad is not None for view in seen)
     return msgspec.structs.replace(
         blank,
         camera_pose=matrix4(quick.X),
         board_pose=matrix4(quick.Y),
-        predicted_error_mm=round(1000 * error_m, 3),
-        working_distance_m=round(distance_m, 4),
-        enough=error_m <= config.capture.goal_m,
+        predicted_error_mm=_mm(error.error_m),
+        floor_mm=_mm(error.floor_m),
+        with_more_views_mm=_mm(error.with_more_views_m),
+        working_distance_m=round(error.distance_m, 4),
+        enough=error.enough(config.capture.goal_m) and gates_would_pass(quick, error, joints_known),
     )
+
+
+LITTLE = 0.05
+"""Share of the error below which it is not worth to take ten more views for it."""
+
+
+@dataclass(frozen=True)
+class QuickError:
+    """The error of a placed point by the views so far, metres."""
+
+    error_m: float
+    from_x_m: float
+    """Part by X: what views lower."""
+    floor_m: float
+    """Part by what the arm does differently each time: what no view lowers."""
+    with_more_views_m: float
+    """What ten more views like these would leave of `error_m`."""
+    distance_m: float
+    """Of the point from the camera."""
+
+    def enough(self, goal_m: float) -> bool:
+        """Tell whether the goal is reached, or is beyond the arm, and more views hardly lower the error."""
+        if self.error_m <= goal_m:
+            return True
+        return self.floor_m > goal_m and self.with_more_views_m > (1.0 - LITTLE) * self.error_m
+
+
+def quick_error(quick: QuickFit, board: BoardSpec, free_lens: bool) -> QuickError:
+    """Predict the error of a placed point by the quick fit, which models no errors of the arm: they are in
+    its noise. LinAlgError where X and Y put the board out of sight.
+    """
+    distance_m = median_distance_m(quick.views.camera_from_board)
+    point = quick_point(quick, distance_m)
+    information, prior = _quick_information(quick, board, free_lens)
+    error_m = predicted_error_m(information, prior, point)
+    from_x = error_m**2 - point.floor_m**2
+    return QuickError(
+        error_m=error_m,
+        from_x_m=float(np.sqrt(max(from_x, 0.0))),
+        floor_m=point.floor_m,
+        with_more_views_m=with_more_views_m(information, prior, point, float(quick.fit.full.sum())),
+        distance_m=distance_m,
+    )
+
+
+def quick_point(quick: QuickFit, distance_m: float) -> PointPrediction:
+    """Predict for a point so far from the camera, at the postures of the views so far."""
+    views = quick.views
+    return PointPrediction.of(views.mount, quick.X, views.base_from_flange, distance_m, quick.noise)
+
+
+MOVED_M = 0.006
+"""Spread of the board's position over the views above which it, or the camera, was moved."""
+
+
+def gates_would_pass(quick: QuickFit, error: QuickError, joints_known: bool) -> bool:
+    """Judge what solving will ask and the quick fit tells already.
+
+    joints_known: the arm's own errors can be learned; else their size is assumed, and nothing fails by it
+    alone.
+    """
+    from calibrate.handeye.estimate import REJECTED  # it loads scipy, the daemon needs none
+
+    limits = GateLimits()
+    noise = quick.noise
+    used = quick.fit.solved.chances[:, :2].sum(axis=1) > REJECTED
+    judged_m = error.error_m if joints_known else error.from_x_m
+    return bool(
+        used.sum() >= (limits.views or 0)
+        and noise.robot_m <= (limits.robot_error_m or np.inf)
+        and np.degrees(noise.robot_rad) <= (limits.robot_error_deg or np.inf)
+        and judged_m <= (limits.predicted_error_m or STATION_ERROR_M)
+        and quick.spread_m <= MOVED_M
+    )
+
+
+def _mm(length_m: float) -> float:
+    return round(1000 * length_m, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +190,13 @@ class QuickFit:
         """By how far the views agree: a coarse arm, or poor light, is not taken for a usual one."""
         return MeasurementNoise(self.poses.corner_px, *self.fit.solved.scales.robot.tolist())
 
+    @property
+    def spread_m(self) -> float:
+        """Rms distance of the board's positions, by single views, from their mean."""
+        flange = self.views.base_from_flange
+        places = board_place(self.views.mount, flange, self.X, self.boards)[:, :3, 3]
+        return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
 
 def solve_quickly(
     mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[BoardView]
@@ -130,15 +225,20 @@ def as_views(mount: Mount, camera: CameraModel, board: BoardSpec, seen: Sequence
 
 def quick_covariance(quick: QuickFit, board: BoardSpec, free_lens: bool) -> Array:
     """Predict the covariance (6, 6) of X. LinAlgError where X and Y put the board out of sight."""
+    return covariance_of(*_quick_information(quick, board, free_lens))[:6, :6]
+
+
+def _quick_information(quick: QuickFit, board: BoardSpec, free_lens: bool) -> tuple[Array, Array]:
+    """Sum the information of the views, and make the prior."""
     views, points = quick.views, board_points(board)
     flange = views.base_from_flange
     each = view_information(views.mount, views.camera, flange, quick.X, quick.Y, points, quick.noise)
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
     # A view that contradicts the others tells nothing.
-    covariance = covariance_of(np.tensordot(quick.fit.full, each, 1), prior)[:6, :6]
-    if not np.isfinite(covariance).all():
+    information = np.tensordot(quick.fit.full, each, 1)
+    if not np.isfinite(information).all():
         raise np.linalg.LinAlgError("the board is out of sight")
-    return covariance
+    return information, prior
 
 
 def seen_before(path: Path, board: BoardSpec) -> list[BoardView]:
@@ -154,5 +254,6 @@ def seen_before(path: Path, board: BoardSpec) -> list[BoardView]:
             found = detect(viewable(image.pixels, image.pixel_format), board, camera=camera)
             if found.found:
                 flange = np.array(view.base_from_flange)
-                seen.append(BoardView(view.index, view.name, flange, found.corners))
+                joints = None if view.joints_rad is None else np.array(view.joints_rad)
+                seen.append(BoardView(view.index, view.name, flange, found.corners, joints))
     return seen

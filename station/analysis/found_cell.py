@@ -21,19 +21,17 @@ from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import (
     FEWEST_FOR_CELL,
     FOCAL_SIGMA,
+    MOVED_M,
     QuickFit,
     quick_covariance,
     solve_quickly,
 )
 from station.cell.errors import StationError
-from station.cell.layout import board_place
 
 GOOD_M, GOOD_RAD = 0.010, math.radians(2.0)
 """1σ of the camera's pose below which the views are enough for planning."""
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 0.003, 0.01
 """Smallest 1σ that is stated, because the true arm differs from its nominal table."""
-_MOVED_M = 0.006
-"""Spread of the board's position over the views above which it, or the camera, was moved."""
 _WRONG_SCALE = 0.03
 """Relative deviation of the squares from their stated size above which a warning is given."""
 _OTHER_MOUNT = 3.0
@@ -46,8 +44,6 @@ class FoundCell(QuickFit):
 
     sigma_m: float
     sigma_rad: float
-    spread_m: float
-    """Rms distance of the board's positions, by single views, from their mean."""
     scale: float
     """Size of the squares, measured by the arm's motion, over the stated size."""
     other_fits: bool
@@ -64,7 +60,7 @@ class FoundCell(QuickFit):
             return StationError("other-mounting")
         if abs(self.scale - 1) > _WRONG_SCALE:
             return StationError("square-size", scale=self.scale)
-        if self.spread_m > _MOVED_M:
+        if self.spread_m > MOVED_M:
             return StationError("board-or-camera-moved", spread_m=self.spread_m)
         return None
 
@@ -81,11 +77,11 @@ def find_cell(
     try:
         quick = solve_quickly(mount, camera, lens_known, board, seen)
         other: Mount = "eye-to-hand" if mount == "eye-in-hand" else "eye-in-hand"
-        other_m = _spread_m(solve_quickly(other, quick.views.camera, True, board, seen))
+        other_m = solve_quickly(other, quick.views.camera, True, board, seen).spread_m
         variances, scale = np.diag(quick_covariance(quick, board, not lens_known)), _scale(quick.views)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None
-    spread_m = _spread_m(quick)
+    spread_m = quick.spread_m
     # Few views give a rough lens, so state at least the disagreement between the views.
     sigma_m = float(np.sqrt(variances[:3].sum() + spread_m**2))
     return FoundCell(
@@ -94,17 +90,9 @@ def find_cell(
         quick.fit,
         sigma_m=max(sigma_m, _LEAST_SIGMA_M),
         sigma_rad=max(float(np.sqrt(variances[3:].sum())), _LEAST_SIGMA_RAD),
-        spread_m=spread_m,
         scale=scale,
         other_fits=_OTHER_MOUNT * other_m < spread_m,
     )
-
-
-def _spread_m(quick: QuickFit) -> float:
-    """Compute the rms distance of the board's positions, by single views, from their mean."""
-    views = quick.views
-    places = board_place(views.mount, views.base_from_flange, quick.X, quick.boards)[:, :3, 3]
-    return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _scale(views: ViewSet) -> float:

@@ -27,7 +27,7 @@ from calibrate.views.projection import project
 from calibrate.views.view_set import BoardView, ViewSet, implied_flange
 from recordings.geometry import Array, pose, rotation_angle, rotation_exp, rotation_log, transform_points
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
-from station.analysis.estimation import as_views
+from station.analysis.estimation import as_views, quick_point
 from station.analysis.found_cell import FoundCell, find_cell
 from station.plan.choose import camera_objective
 from station.plan.visibility import ViewRange, camera_views, distances_that_fill, outline, roll_of, visible
@@ -65,7 +65,7 @@ class NextView:
     found: FoundCell | None = None
     """The cell by the views so far; None: they are not enough."""
     after_m: float | None = None
-    """Predicted error (`point_error_m`) at the board's distance with the wanted view."""
+    """Error of a placed point at the board's distance with the wanted view, at the postures so far."""
 
     @property
     def outline(self) -> Array:
@@ -132,7 +132,8 @@ def next_view(
     best = int(np.argmin(objective(known + gains)))
     after_m = None
     if found is not None:
-        after_m = predicted_error_m(known + gains[best], objective.prior, X, distance_m)
+        point = quick_point(found, distance_m)
+        after_m = predicted_error_m(known + gains[best], objective.prior, point)
     return NextView(mount, board, lens, at, pool[best], found, after_m)
 
 

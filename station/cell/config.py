@@ -219,7 +219,8 @@ class CaptureConfig(Section, frozen=True):
     0.04 mm at one metre."""
     free_space_bytes: Annotated[int, msgspec.Meta(ge=0)] = 2_000_000_000
     goal_m: Annotated[float, msgspec.Meta(gt=0, le=0.05)] = 0.001
-    """Predicted error (1σ of a point at the board's distance) below which the session is complete enough."""
+    """Placed-point error (1σ, at the board's distance) below which the session is complete enough. Where the
+    arm's own part is above it: when ten more views would lower the error by less than 5 %."""
 
 
 class ValidityConfig(Section, frozen=True):

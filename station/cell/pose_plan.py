@@ -35,7 +35,8 @@ class PlannedPose(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknow
     view: ExpectedView | None = None
     why: str = ""
     predicted_sigma_m: float | None = None
-    """Predicted error (1σ) of a point at the plan's working distance after this pose."""
+    """Placed-point error (1σ) at the plan's working distance after this pose, at the postures of all poses.
+    In plans without `floor_m`: X's part alone."""
     guided: bool = False
     """True when a person brought the arm there by hand."""
 
@@ -54,11 +55,13 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     criterion: Criterion | None = None
     """Criterion by which the planner chose the poses; None: a person taught, listed or changed some."""
     working_distance_m: float | None = None
-    """Median distance of camera and board, for which the poses state a predicted error."""
+    """Median distance of camera and board, for which the poses state a placed-point error."""
+    floor_m: float | None = None
+    """Part of these errors by a usual arm's noise: no pose lowers it. None: older plans."""
 
     def predicted_error_m(self, index: int) -> float | None:
-        """Predicted error with the poses up to this one; None: not known, or another figure (older plans)."""
-        return None if self.working_distance_m is None else self.poses[index].predicted_sigma_m
+        """Placed-point error with the poses up to this one; None: not known, or of X alone (older plans)."""
+        return None if self.floor_m is None else self.poses[index].predicted_sigma_m
 
 
 def plan_sha256(plan: Plan) -> str:

@@ -55,7 +55,7 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     corners: int | None = None
     predicted_sigma_mm: float | None = None
     estimated_sigma_mm: float | None = None
-    """Predicted error after this pose, by the images so far (`predicted_sigma_mm`: when planned)."""
+    """Placed-point error after this pose, by the images so far (`predicted_sigma_mm`: when planned)."""
     base_from_flange: Matrix4 | None = None
     """Expected flange pose."""
     kept: bool = False
@@ -188,8 +188,12 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
     views: int = 0
     predicted_error_mm: float | None = None
-    """1σ of a point at the working distance, by the noise that the images so far show. Solving adds errors of
-    the arm that are the same in every image."""
+    """Placed-point error (1σ) at the working distance, by the noise that the images so far show. Solving adds
+    errors of the arm that are the same in every image."""
+    floor_mm: float | None = None
+    """Part of it by what the arm does differently each time: no view lowers it."""
+    with_more_views_mm: float | None = None
+    """What ten more views like these would leave of it."""
     working_distance_m: float | None = None
     """Median distance of camera and board."""
     camera_pose: Matrix4 | None = None
@@ -197,7 +201,8 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     board_pose: Matrix4 | None = None
     """Pose of the board in the base (eye-in-hand) or the flange."""
     enough: bool = False
-    """The predicted error reached `capture.goal_m`."""
+    """The placed-point error reached `capture.goal_m`, or the arm's own part of it is above that and ten more
+    views would lower it by less than 5 %; and what solving will ask, as far as it is known, passes."""
     image_views: tuple[tuple[int, ...], ...] = ()
     """Images that show the board in each part of the image, rows from the top."""
 
@@ -219,7 +224,7 @@ class GuidanceStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     moves: str = ""
     """What still moves; empty: nothing."""
     after_mm: float | None = None
-    """Predicted error after the wanted view; now: `EstimateStatus.predicted_error_mm`."""
+    """Placed-point error after the wanted view; now: `EstimateStatus.predicted_error_mm`."""
     cause: str = ""
     """Code of what is probably wrong with the cell; empty: nothing."""
     warning: str = ""
@@ -233,7 +238,9 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     folder: str = ""
     poses: tuple[PoseStatus, ...] = ()
     working_distance_m: float | None = None
-    """Distance of the point whose predicted error the plan states."""
+    """Distance of the point whose placed-point error the plan states."""
+    floor_mm: float | None = None
+    """Part of the plan's placed-point errors by a usual arm's noise: no view lowers it."""
     current: int | None = None
     """Number of the pose under way, or of the last one."""
     captured: int = 0

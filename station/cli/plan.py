@@ -24,6 +24,7 @@ from station.cell.limits import PlanCheck, Problem, check_plan
 from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.socket_folder import default_socket
 from station.cli.console import AsJson, Socket, err, out, print_json
+from station.operate.goal import above_goal
 from station.operate.motion import status_now
 from station.plan.choose import CRITERIA, Aim
 from station.plan.files import load_plan, save_plan
@@ -134,6 +135,9 @@ class PlanJson(msgspec.Struct, frozen=True):
     largest_step_rad: float
     top_speed_m_s: float
     predicted_error_mm: float | None
+    """Placed-point error (1σ) after the last pose."""
+    floor_mm: float | None
+    """Part of it by a usual arm's noise: no pose lowers it."""
     note: str
     problems: list[Problem]
 
@@ -151,6 +155,7 @@ def _summary(plan: Plan, cell: StationConfig, outcome: PlanCheck) -> PlanJson:
         largest_step_rad=round(outcome.largest_step_rad, 4),
         top_speed_m_s=round(outcome.top_speed_m_s, 4),
         predicted_error_mm=None if last is None else round(1000 * last, 4),
+        floor_mm=None if plan.floor_m is None else round(1000 * plan.floor_m, 4),
         note=plan.note,
         problems=list(outcome.problems),
     )
@@ -182,6 +187,8 @@ def _show(plan: Plan, outcome: PlanCheck, goal_m: float) -> None:
             f"{error.label} {error.about}: {error.value}, goal {1000 * goal_m:g} mm (capture.goal_m), "
             "if corners and arm are as good as assumed"
         )
+    if plan.floor_m is not None and (said := above_goal(1000 * plan.floor_m, 1000 * goal_m)):
+        out.print(f"{said[0].upper()}{said[1:]}.")
     if plan.note:
         out.print(f"note: {plan.note}")
     for problem in outcome.problems:

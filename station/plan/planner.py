@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from calibrate.arms.chain import chain_of
 from calibrate.arms.kinematics import forward
 from calibrate.boards.model import board_points
 from calibrate.handeye.information import USUAL_NOISE, predicted_error_m
 from calibrate.handeye.metrics import median_distance_m
 from calibrate.handeye.noise_scales import MeasurementNoise
+from calibrate.handeye.placed_point import PointPrediction
 from recordings.geometry import Array
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
@@ -33,7 +35,7 @@ from station.plan.visibility import ViewRange, expected_view, planned_pose, view
 
 Progress = Callable[[str, float], None]
 POOL_SIZE = 1200
-"""Size of the pool. Compared with 480, both predicted errors are 4 to 6 % smaller (random cells)."""
+"""Size of the pool. Compared with 480, both placed-point errors are 4 to 6 % smaller (random cells)."""
 _TRIES = 12
 """Views drawn per wanted member of the pool; most are rejected for the uncertainty of the initial poses."""
 _LOOKS_BACK = "the camera looks back at the arm, which hides the board"
@@ -248,15 +250,18 @@ def _describe(
     objective: Objective,
 ) -> Plan:
     known = gained.cumsum(axis=0)
-    C = layout.camera_from_board(forward(layout.geometry.model, joints))
-    distance_m = median_distance_m(C)
+    model = layout.geometry.model
+    flange = forward(model, joints)
+    distance_m = median_distance_m(layout.camera_from_board(flange))
+    by_links = chain_of(model).by_links(joints) if options.criterion == "arm" else None
+    point = PointPrediction.of(layout.mount, layout.X, flange, distance_m, options.noise, by_links)
     poses = tuple(
-        planned_pose(layout, number, q, predicted_error_m(total, objective.prior, layout.X, distance_m))
+        planned_pose(layout, number, q, predicted_error_m(total, objective.prior, point))
         for number, (q, total) in enumerate(zip(joints, known, strict=True))
     )
     limits = layout.geometry.limits
     return Plan(
-        robot=layout.geometry.model.name,
+        robot=model.name,
         mount=layout.mount,
         poses=poses,
         joint_speed_rad_s=limits.joint_speed_rad_s,
@@ -264,4 +269,5 @@ def _describe(
         seed=options.seed,
         criterion=options.criterion,
         working_distance_m=round(distance_m, 4),
+        floor_m=round(point.floor_m, 9),
     )

@@ -138,7 +138,8 @@ async def _write(context: SessionContext, index: int, image: Image, view: View, 
         context.store.update(detection=detection_status(sighting))
         flange = np.array(view.base_from_flange)
         context.seen.pop(index, None)  # the newest comes last
-        context.seen[index] = BoardView(index, view.name, flange, sighting.detection.corners)
+        joints = None if view.joints_rad is None else np.array(view.joints_rad)
+        context.seen[index] = BoardView(index, view.name, flange, sighting.detection.corners, joints)
     queue.mark(index, "done")
     await recording.save_state(queue)
     context.show_poses(index)

@@ -186,6 +186,7 @@ class SessionContext:
         self.store.update_session(
             poses=queue.statuses,
             working_distance_m=queue.plan.working_distance_m,
+            floor_mm=None if queue.plan.floor_m is None else round(1000 * queue.plan.floor_m, 4),
             current=current,
             captured=queue.done,
             **named,

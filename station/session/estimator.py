@@ -59,7 +59,7 @@ class Estimator:
             except Exception as error:  # the capture does not depend on it, so it must not end
                 if not isinstance(error, WorkerError):
                     log.exception("the running estimate failed")
-                context.store.problem(error, said="the predicted error is not updated: {}")
+                context.store.problem(error, said="the placed-point error is not updated: {}")
                 continue
             context.store.update(estimate=estimate)
             if odd is not None:

@@ -1,14 +1,15 @@
-"""Panels of the capture screen: image quality, predicted error, coverage of the image."""
+"""Panels of the capture screen: image quality, placed-point error, coverage of the image."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Sequence
 
 from textual.content import Content
 
 from station.cell.status import DetectionStatus, GuidanceStatus, PoseStatus
-from station.tui.task import Known
+from station.tui.task import Known, beyond_goal
 from station.tui.words import ERROR_SHOWN_MM, dim, error_facts, facts, limit_bar, lines, mark
 
 STILL_CELLS = 12
@@ -56,25 +57,30 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
 
 
 def error_lines(known: Known, width: int, height: int) -> Content:
-    """Write the predicted error and the goal; draw the error after each pose. A drift check has neither."""
+    """Write the placed-point error and the goal; draw it after each pose. A drift check has neither."""
     if known.shown.session.check:
         return dim("When all images are taken, they\njudge the installed calibration.")
     estimate, poses, goal = known.shown.estimate, known.shown.session.poses, known.goal_mm
     head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:
         head += Content("  ") + mark("done" if estimate.enough else "todo", f"goal {goal:g} mm")
-    return lines(head, *error_columns(errors_after(poses), goal, width, height - 1))
+    said = [Content.styled(row, "$warn") for row in textwrap.wrap(beyond_goal(known), max(width, 1))]
+    columns = error_columns(errors_after(poses, estimate.floor_mm), goal, width, height - 1 - len(said))
+    return lines(head, *said, *columns)
 
 
-def errors_after(poses: Sequence[PoseStatus]) -> list[tuple[float | None, bool]]:
-    """Return the predicted error after each pose (mm), and whether by images.
+def errors_after(
+    poses: Sequence[PoseStatus], floor_mm: float | None = None
+) -> list[tuple[float | None, bool]]:
+    """Return the placed-point error after each pose (mm), and whether by images.
 
-    Planned with a usual noise, it is no larger than what the images showed before: views only add.
+    Planned with a usual noise, it is no larger than what the images showed before: views only add; and no
+    smaller than `floor_mm`, the part of this arm's noise, where images showed that.
     """
     errors, shown_mm = list[tuple[float | None, bool]](), math.inf
     for pose in poses:
         shown_mm = pose.estimated_sigma_mm or shown_mm
-        planned_mm = pose.predicted_sigma_mm and min(pose.predicted_sigma_mm, shown_mm)
+        planned_mm = pose.predicted_sigma_mm and min(max(pose.predicted_sigma_mm, floor_mm or 0.0), shown_mm)
         errors.append((pose.estimated_sigma_mm or planned_mm, bool(pose.estimated_sigma_mm)))
     return errors
 

@@ -38,7 +38,7 @@ class CaptureScreen(StationScreen):
                 yield Line(lambda known, _: quality_line(known.shown.detection), id="quality")
             with Vertical(id="live-right"):
                 yield Panel("Poses", progress_lines, id="progress", below=LEGEND)
-                yield Panel("Predicted error", error_lines, id="error", below=ERROR_LEGEND)
+                yield Panel("Placed-point error", error_lines, id="error", below=ERROR_LEGEND)
                 yield Panel("Where the board was seen", coverage_lines, id="coverage", below="images")
         yield Stopped(id="stopped")
 
@@ -59,7 +59,7 @@ class CaptureScreen(StationScreen):
         if not by_hand and session.current is not None and status.state in RUNNING:
             progress.heading = f"Pose {session.current + 1} of {len(session.poses)}"
         error = self.query_one("#error", Panel)
-        error.heading = "Drift check" if session.check else "Predicted error"
+        error.heading = "Drift check" if session.check else "Placed-point error"
         error.border_subtitle = "" if session.check else ERROR_LEGEND
         self.query_one("#picture").border_title = (
             f"Camera  {status.camera.model}"

@@ -10,13 +10,14 @@ from textual.containers import Horizontal
 from textual.content import Content
 
 from station.cell.status import PoseStatus
+from station.operate.goal import above_goal, joints_would_win
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import MakePlan, Retake, Skip
 from station.tui.capture_panels import errors_after
 from station.tui.frame import Line
 from station.tui.progress import pose_mark
 from station.tui.screen import Box, Panel, Rows, StationScreen
-from station.tui.task import Known
+from station.tui.task import Known, beyond_goal
 from station.tui.widgets.cell_drawing import LEGEND, draw
 from station.tui.words import ERROR_SHOWN_MM, MARKS, UNKNOWN, dim, error_facts, facts, mark
 
@@ -28,6 +29,15 @@ SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses: takes some seconds, nothing moves"
 NEW_PLAN = MakePlan(25, seed=1)
 POSE_VERBS = {"retake": Retake, "skip": Skip}
+
+
+def by_hand(known: Known) -> str:
+    """Say that nothing is planned here, and what joints would win where the arm tells none."""
+    robot = known.shown.robot
+    if robot.state is None or robot.state.joints_rad:
+        return BY_HAND
+    told = "" if known.configuration is None else known.configuration.robot.arm_class
+    return f"{BY_HAND} {joints_would_win(robot.model, told)}"
 
 
 def row_of(pose: PoseStatus, error_mm: float | None) -> tuple[Content, ...]:
@@ -50,13 +60,14 @@ def facts_line(known: Known) -> Content:
     """Sum the plan up in one line."""
     session, goal_mm = known.shown.session, known.goal_mm
     if not (poses := session.poses):
-        return dim(BY_HAND if known.shown.robot.by_hand else NO_PLAN)
-    end_mm, _ = errors_after(poses)[-1]
+        return dim(by_hand(known) if known.shown.robot.by_hand else NO_PLAN)
+    end_mm, _ = errors_after(poses, known.shown.estimate.floor_mm)[-1]
     line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose")) + Content("   ")
-    line += error_facts("predicted error at the end", end_mm, session.working_distance_m)
+    line += error_facts("placed-point error at the end", end_mm, session.working_distance_m)
     if end_mm is not None and goal_mm is not None:
         line += Content("   ") + mark("done" if end_mm <= goal_mm else "look", f"goal {goal_mm:g} mm")
-    return line
+    said = beyond_goal(known) or above_goal(session.floor_mm, goal_mm)
+    return line + Content.styled(f"   {said}", "$warn") if said else line
 
 
 class PlanScreen(StationScreen):
@@ -72,14 +83,15 @@ class PlanScreen(StationScreen):
     def body(self) -> ComposeResult:
         yield Line(lambda known, _: facts_line(known), id="plan-facts")
         with Horizontal(id="plan"):
-            with Box("Poses", id="plan-poses", below="predicted error after each, 1σ  Enter tells all"):
+            with Box("Poses", id="plan-poses", below="placed-point error after each, 1σ  Enter tells all"):
                 yield Rows(*COLUMNS, id="plan-table")
             yield Panel("The cell", self._cell, id="plan-cell", below=LEGEND)
 
     def show(self, known: Known) -> None:
         super().show(known)
         poses = known.shown.session.poses
-        rows = [row_of(pose, mm) for pose, (mm, _) in zip(poses, errors_after(poses), strict=True)]
+        errors = errors_after(poses, known.shown.estimate.floor_mm)
+        rows = [row_of(pose, mm) for pose, (mm, _) in zip(poses, errors, strict=True)]
         self.table.show(rows)
 
     def _cell(self, known: Known, width: int, height: int) -> Content:

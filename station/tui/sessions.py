@@ -18,7 +18,7 @@ from station.tui.task import Known
 from station.tui.words import VERDICTS, facts, mark
 
 NO_SESSION = "No session is recorded yet: F5 plans one, shows its path and asks."
-COLUMNS = ("session", "state", "verdict", "views", "predicted error")
+COLUMNS = ("session", "state", "verdict", "views", "placed-point error")
 
 
 class SessionsScreen(StationScreen):

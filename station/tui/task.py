@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from calibrate.files.validity import validity_text
 from station.cell.config import StationConfig
 from station.cell.status import NO_IMAGE, DetectionStatus, GuidanceStatus, StationState, StationStatus
+from station.operate.goal import above_goal
 from station.operate.next_step import StepKind, after_solve
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
@@ -104,12 +105,18 @@ class Known:
 
     @property
     def goal_mm(self) -> float | None:
-        """Predicted error at which the views are enough; None: not told yet."""
+        """Placed-point error at which the views are enough; None: not told yet."""
         return None if self.configuration is None else 1000 * self.configuration.capture.goal_m
 
     @property
     def missing(self) -> Check | None:
         return next((check for check in self.checks if check.state == "failed"), None)
+
+
+def beyond_goal(known: Known) -> str:
+    """Say that no view lowers the error to the goal, by the images so far; empty where one may."""
+    seen = known.shown.estimate
+    return above_goal(seen.floor_mm, known.goal_mm, seen.predicted_error_mm, seen.with_more_views_mm)
 
 
 def steps(known: Known) -> tuple[Step, ...]:
@@ -235,9 +242,11 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
         why = sentence(status.reason) or "The robot does not answer."
         return Action("", "See what is missing", why, at="connect", look=True)
     if status.guidance.outline and state in (*RUNNING, StationState.FREE_DRIVE):
-        return _by_hand(status)
+        return _by_hand(known, status)
     if state in RUNNING:
         good = "Good enough already: F7 finishes. " if status.estimate.enough else ""
+        if beyond := beyond_goal(known):
+            good = f"{sentence(beyond)} {'F7 finishes. ' if status.estimate.enough else ''}"
         failed = [pose for pose in status.session.poses if pose.state == "failed"]
         lost = f"{many(len(failed), 'pose')} failed: {failed[-1].reason}" if failed else ""
         why = status.pending or status.reason or lost or f"{good}F12 stops it at once, F6 after this pose."
@@ -257,12 +266,14 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     return None
 
 
-def _by_hand(status: StationStatus) -> Action:
+def _by_hand(known: Known, status: StationStatus) -> Action:
     guidance, seen = status.guidance, status.detection
     if status.state in RUNNING:
         return Action("", "Hold still", "The view is being taken.")
     if guidance.enough:
-        return Action("F7", "Enough: finish", f"{many(status.session.captured, 'view')} are saved.")
+        saved = f"{many(status.session.captured, 'view')} are saved."
+        beyond = "" if status.session.check else sentence(beyond_goal(known))
+        return Action("F7", "Enough: finish", f"{saved} {beyond}".strip())
     return to_wanted(guidance, seen)
 
 

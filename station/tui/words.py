@@ -77,7 +77,7 @@ def facts(*pairs: tuple[str, str, str]) -> Content:
 
 
 def error_facts(label: str, error_mm: float | None, distance_m: float | None) -> Content:
-    """Write a predicted error as pages and commands do; metres, after the first poses, say nothing."""
+    """Write a placed-point error as pages and commands do; metres, after the first poses, say nothing."""
     known = error_mm is not None and error_mm <= ERROR_SHOWN_MM
     figure = predicted_error(error_mm if known else None, distance_m)
     return facts((label, figure.value, figure.about))

@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from calibrate.arms.classes import ARM_CLASSES, CLASSES_HELP
+from calibrate.arms.without_joints import joints_would_win
 from calibrate.boards.model import typed_board
 from calibrate.errors import require_choice
 from calibrate.imported import Given, believe, is_described
@@ -144,11 +145,12 @@ def import_command(
                 raise
             reading = reading.with_options(_asked(problem, console).options)
     size_bytes = target.stat().st_size if target else 0
-    facts = ImportJson(str(target or ""), done.images, size_bytes, done.facts, done.unused)
+    facts = ImportJson(str(target or ""), done.images, size_bytes, done.with_joints, done.facts, done.unused)
     if as_json:
         print_json(facts)
     else:
-        _print_import(facts)
+        lacks = "" if done.with_joints else joints_would_win(done.robot.model, done.robot.arm_class)
+        _print_import(facts, lacks)
 
 
 def _is_folder_of_anyone(source: Path) -> bool:
@@ -242,20 +244,24 @@ class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
     """Empty with --dry-run."""
     views: int
     bytes: int
+    with_joints: bool
+    """Every pose has the arm's joints; without them the arm's own error is assumed by its class."""
     found: dict[str, tuple[str, str]] = {}
     """What → (what is believed, its evidence)."""
     not_used: list[str] = []
     """Files that were seen and not used, one line a kind."""
 
 
-def _print_import(facts: ImportJson) -> None:
-    """Print what `recordings import` took, or would take."""
+def _print_import(facts: ImportJson, lacks: str) -> None:
+    """Print what `recordings import` took, or would take, and in a sentence what it lacks."""
     for what, (believed, evidence) in facts.found.items():
         print(plain_text(f"{what:<11}{believed:<41} {evidence}".rstrip()))
     for n, line in enumerate(facts.not_used[:_UNUSED_LINES]):
         print(plain_text(f"{'' if n else 'not used':<11}{line}"))
     if len(facts.not_used) > _UNUSED_LINES:
         print(f"{'':<11}{len(facts.not_used) - _UNUSED_LINES} more kinds of files; --json names all")
+    if lacks:
+        print(plain_text(lacks))
     if not facts.recording:
         print(plain_text(f"{facts.views} views would be taken; nothing was written"))
         return

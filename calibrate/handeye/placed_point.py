@@ -122,10 +122,10 @@ class PointPrediction:
     """The error of a placed point by what views tell so far: while capturing, and for a plan.
 
     The mean of e is zero: X̂ is the best X, and errors of the arm that are modelled are corrected by their
-    best. Of e as the module's text has it, E|e|² = trace(K C) + E|L(b) δ(b) - L(a) δ(a)|²: C is the covariance
-    of [X, errors], K the mean, over pairs of postures, of Jᵀ J, and δ the arm's noise alone, independent at
-    both postures. Where no errors of the arm are modelled, a noise that was fitted to views holds the part of
-    them that varies from view to view; the part that all views share is not seen.
+    best. Of e as the module's text has it, E|e|² = trace(K C) + E|L(b) δ(b) - L(a) δ(a)|²: C is the
+    covariance of [X, errors], K the mean, over pairs of postures, of Jᵀ J, and δ the arm's noise alone,
+    independent at both postures. Where no errors of the arm are modelled, a noise that was fitted to views
+    holds the part of them that varies from view to view; the part that all views share is not seen.
     """
 
     point: PlacedPoint

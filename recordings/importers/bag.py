@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -43,8 +44,12 @@ def import_bag(
         bag, _ = next(answers, (None, []))
         if not isinstance(bag, BagRead):
             raise unexpected(source)
+        robot = bag.robot
+        if arm_class is not None:
+            robot = msgspec.structs.replace(robot, arm_class=arm_class)
+        done = Imported(source, bag.stops, bag.facts, robot=robot, with_joints=bag.with_joints)
         if output is None:
-            return Imported(source, bag.stops, bag.facts)
+            return done
         session, attached = next(answers, (None, []))
         if not isinstance(session, SessionRead) or len(attached) != 1:
             raise unexpected(source)
@@ -56,7 +61,7 @@ def import_bag(
             writer.attach(DATASET_FILE, "application/yaml", attached[0])
             writer.attach("import.json", "application/json", msgspec.json.encode(bag.facts))
             _write(writer, source, answers, bag.stops, progress)
-            return Imported(writer.finish(), bag.stops, bag.facts)
+            return replace(done, path=writer.finish())
 
 
 def _write(

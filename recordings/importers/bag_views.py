@@ -27,6 +27,7 @@ from recordings.schema.messages import (
     CameraModel,
     Joints,
     Matrix4,
+    RobotIdentity,
     RobotState,
     SessionInfo,
     Stamps,
@@ -76,7 +77,9 @@ def read_bag(request: ReadBag, progress: Progress) -> Iterator[Frame]:
         if request.views and len(stops) < STOPS_LEAST:
             counts = {"stops": len(stops), "images": len(images_ns), "limit": STOPS_LEAST}
             raise ImportSourceError("no-stops", source=source, passed_over=why, **counts)
-        yield BagRead(len(stops), facts), ()
+        seen = [joints.at(stop.stamp_ns, request.pair_within_s) for stop in stops] if joints else [None]
+        robot = described.robot_identity if described else RobotIdentity()
+        yield BagRead(len(stops), facts, robot, with_joints=None not in seen), ()
         if not request.views:
             return
         assert described is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from recordings.errors import ImportSourceError
@@ -16,6 +16,7 @@ from recordings.schema.messages import (
     NO_PICTURE,
     CaptureEvent,
     Image,
+    RobotIdentity,
     Stamps,
     View,
 )
@@ -32,6 +33,10 @@ class Imported:
     """What → (what is believed, its evidence), for people."""
     unused: list[str] = field(default_factory=list)
     """Files that were seen and not used, one line a kind, for people."""
+    robot: RobotIdentity = field(default_factory=RobotIdentity)
+    """The arm as it was told; its class, too."""
+    with_joints: bool = False
+    """Every pose has the arm's joints."""
 
 
 def import_folder(
@@ -84,12 +89,14 @@ def _write(
     camera = dataset.camera
     assert camera is not None
     size = (camera.width, camera.height)
+    with_joints = all(row.joints_rad is not None for row in rows)
+    done = Imported(folder, len(rows), robot=dataset.robot_identity, with_joints=with_joints)
     if output is None:
         for index, row in enumerate(rows):
             if row.camera_from_board is None:
                 read_image(folder, row, size)  # a damaged image has a sound header
             progress(index + 1, len(rows), "checking")
-        return Imported(folder, len(rows))
+        return done
     with derived_recording(output, dataset.session(folder, camera, newest_ns)) as writer:
         for name, content in beside.items():
             writer.attach(name, _MEDIA[Path(name).suffix], content)
@@ -98,7 +105,7 @@ def _write(
             progress(index + 1, len(rows), "importing")
         stamps = Stamps(host_wall_ns=writer.info.created_wall_ns)
         writer.event(CaptureEvent(stamps, "imported", detail=f"{len(rows)} views"))
-        return Imported(writer.finish(), len(rows))
+        return replace(done, path=writer.finish())
 
 
 def read_image(folder: Path, row: PoseRow, size: tuple[int, int]) -> tuple[str, bytes, Pixels]:

@@ -15,7 +15,7 @@ import msgspec
 
 from recordings.errors import Value
 from recordings.importers.dataset import Dataset
-from recordings.schema.messages import Joints, RobotState, SessionInfo, Stamps, View
+from recordings.schema.messages import Joints, RobotIdentity, RobotState, SessionInfo, Stamps, View
 
 JSON_LIMIT_BYTES = 64 * 1024 * 1024
 BLOB_LIMIT_BYTES = 64 * 1024 * 1024
@@ -154,6 +154,10 @@ class BagRead(msgspec.Struct, frozen=True, tag=True):
 
     stops: int
     facts: dict[str, tuple[str, str]]
+    robot: RobotIdentity
+    """As its description tells it; empty without one."""
+    with_joints: bool
+    """Every stop has the arm's joints."""
 
 
 class SessionRead(msgspec.Struct, frozen=True, tag=True):

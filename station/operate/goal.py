@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from calibrate.arms.classes import arm_class
-
 _LITTLE = 0.05
 """Share of the error below which ten more views are not said to lower it."""
 
@@ -25,13 +23,3 @@ def above_goal(
     if error_mm is None or with_more_views_mm is None or with_more_views_mm > (1.0 - _LITTLE) * error_mm:
         return f"{above}: more poses do not help"
     return f"{above}: ten more poses lower {error_mm:.2g} mm to {with_more_views_mm:.2g} mm"
-
-
-def joints_would_win(robot_model: str, told_class: str = "") -> str:
-    """Say what joints with every pose would win, where they are not recorded."""
-    of_class = arm_class(robot_model, told_class)
-    assumed = f"{1e3 * of_class.shift_m:.2g} mm and {1e3 * of_class.turn_rad:.2g} mrad"
-    return (
-        "Joints with every pose would let the arm's own error be learned: without them "
-        f"{assumed} per axis (1σ) are assumed, as of {of_class.title}."
-    )

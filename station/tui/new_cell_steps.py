@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import msgspec
 from textual.content import Content
 
+from calibrate.arms.without_joints import joints_would_win
 from calibrate.boards.model import describe_board, typed_board
 from recordings.errors import CodedError
 from recordings.schema.messages import Mount
@@ -91,7 +92,7 @@ def about(setup: CellSetup, step: CellStep) -> str:
     if step is CellStep.VIEWS and remote:
         return REMOTE_ON
     if step is CellStep.SAVE and setup.draft.posted:
-        return POSTED_SAVE
+        return f"{POSTED_SAVE} {joints_would_win(setup.draft.posted)}"
     if step is CellStep.SAVE and remote is False:
         return f"{PAGES[step].words} {REMOTE_OFF}"
     return PAGES[step].words

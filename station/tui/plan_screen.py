@@ -9,8 +9,9 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal
 from textual.content import Content
 
+from calibrate.arms.without_joints import joints_would_win
 from station.cell.status import PoseStatus
-from station.operate.goal import above_goal, joints_would_win
+from station.operate.goal import above_goal
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import MakePlan, Retake, Skip
 from station.tui.capture_panels import errors_after

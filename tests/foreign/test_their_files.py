@@ -159,7 +159,7 @@ def test_a_dry_run_says_what_would_be_taken_and_writes_nothing(tmp_path: Path) -
     said = json.loads(result.stdout)
     assert (result.returncode, said["views"], said["recording"]) == (0, STOPS, "")
     assert said["found"]["images"][0].endswith(" /cam/image_raw")
-    assert said["found"]["joints"][0] == "/joint_states"
+    assert said["found"]["joints"][0] == "/joint_states" and said["with_joints"]
     assert [path.name for path in tmp_path.iterdir()] == ["bag"]
     assert call(main, "import", source).returncode == 2, "neither an output nor a dry run"
 

@@ -5,12 +5,19 @@ from __future__ import annotations
 import msgspec
 from textual.widgets._footer import FooterKey
 
-from station.cell.status import DetectionStatus, GuidanceStatus, PoseStatus, StationState, StationStatus
+from station.cell.status import (
+    DetectionStatus,
+    EstimateStatus,
+    GuidanceStatus,
+    PoseStatus,
+    StationState,
+    StationStatus,
+)
 from station.protocol import verbs
 from station.tui.app import StationApp
 from station.tui.task import Known, next_action
 from station.tui.widgets.preview import PreviewPane
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, until, with_robot
+from tests.tui.conftest import CELL, FakeLink, app_on, idle, in_session, until, with_robot
 
 OUTLINE = ((0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
 
@@ -69,6 +76,12 @@ def test_next_is_the_way_until_it_is_enough() -> None:
     moved = next_action(Known(by_hand(6, cause="moved", warning="The board moved.")))
     assert moved.look and moved.why == "The board moved."
     assert next_action(Known(by_hand(12, enough=True))).key == "F7"
+    beyond = EstimateStatus(12, predicted_error_mm=1.9, floor_mm=1.8, with_more_views_mm=1.87)
+    noisy = msgspec.structs.replace(by_hand(12, enough=True), estimate=beyond)
+    finish = next_action(Known(noisy, configuration=CELL))
+    assert finish.key == "F7" and "1.8 mm" in finish.why and "1 mm" in finish.why
+    check = next_action(Known(in_session(noisy, check=True), configuration=CELL))
+    assert "1.8 mm" not in check.why, "a drift check has no goal"
     silent = msgspec.structs.replace(by_hand(12), state=StationState.DISCONNECTED, guidance=GuidanceStatus())
     silent = with_robot(silent, by_hand=True)
     assert next_action(Known(silent)).on("capture").key == "1"

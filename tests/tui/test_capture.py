@@ -75,12 +75,19 @@ def test_the_error_falls_towards_its_goal() -> None:
     status = msgspec.structs.replace(in_session(idle(), poses=poses), estimate=estimate)
     falling = [error_mm for error_mm, _ in errors_after(poses)]
     assert falling == sorted(falling, reverse=True), "more views make nothing worse"
+    noisy = tuple(msgspec.structs.replace(p, estimated_sigma_mm=1.5 if p.index < 6 else None) for p in poses)
+    floored = [error_mm for error_mm, _ in errors_after(noisy, floor_mm=1.2)]
+    assert floored == [1.5] * 6 + [1.2] * 19, "the planned ones are those of this arm"
     lines = error_lines(Known(status, configuration=CELL), 60, 14).plain.split("\n")
     assert all(said in lines[0] for said in ("0.83 mm", "500 mm", "goal 1 mm")) and "✓" not in lines[0]
     assert len(lines) == 14
     assert any(line.startswith(" 1.00 ") for line in lines)
     enough = msgspec.structs.replace(status, estimate=msgspec.structs.replace(estimate, enough=True))
     assert "✓ goal 1 mm" in error_lines(Known(enough, configuration=CELL), 60, 14).plain
+    coarse = msgspec.structs.replace(estimate, floor_mm=1.2, with_more_views_mm=0.82)
+    beyond = error_lines(Known(msgspec.structs.replace(status, estimate=coarse), configuration=CELL), 60, 14)
+    assert "1.2 mm" in beyond.plain and "1.2 mm" not in "\n".join(lines)
+    assert len(beyond.plain.split("\n")) == 14 and max(map(len, beyond.plain.split("\n"))) <= 60
     check = in_session(enough, poses=poses, check=True)
     assert "mm" not in error_lines(Known(check, configuration=CELL), 60, 14).plain
 

@@ -28,6 +28,7 @@ from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
 from station.tui.frame import StopBlock
 from station.tui.new_cell import NewCell
+from station.tui.new_cell_steps import about
 from tests.codes import raises
 from tests.conftest import check_allow_list
 from tests.station.operate.guided_views import guided_joints
@@ -176,6 +177,7 @@ async def test_an_arm_that_a_program_posts_needs_a_name_a_camera_and_a_board(tmp
         await at(CellStep.BOARD, "enter")
         assert "pendant" in str(app.query_one(StopBlock).render())
         await at(CellStep.SAVE, "f9")
+        assert "0.6 mm and 1.5 mrad" in about(app.setup, CellStep.SAVE), "what joints would win"
         assert not app.return_value, "nothing of it can be rehearsed"
         await pilot.press("enter")
         await until(pilot, lambda: app.return_value)

@@ -7,9 +7,14 @@ import asyncio
 import msgspec
 from textual.widgets import DataTable
 
+from calibrate.arms.classes import ARM_CLASSES
+from recordings.schema.messages import RobotIdentity
+from station.cell.status import EstimateStatus, PoseStatus, StationStatus
 from station.protocol import verbs
 from station.tui.daemon_link import BUSY
-from tests.tui.conftest import FakeLink, idle, in_session, opened, said, text_of, until
+from station.tui.plan_screen import facts_line
+from station.tui.task import Known
+from tests.tui.conftest import CELL, FakeLink, idle, in_session, opened, said, text_of, until, with_robot
 
 
 async def test_it_says_that_it_plans_for_as_long_as_it_does(link: FakeLink) -> None:
@@ -57,3 +62,25 @@ async def test_a_key_between_a_shorter_plan_and_its_drawing_asks_nothing(link: F
         await pilot.press("r")
         await until(pilot, lambda: link.verbs)
         assert link.verbs == ["retake"] and verbs.Retake(7) in link.asked
+
+
+def told(status: StationStatus) -> str:
+    return facts_line(Known(status, configuration=CELL)).plain
+
+
+def test_a_goal_that_the_arm_does_not_reach_is_told_before_and_while_it_is_captured() -> None:
+    poses = tuple(PoseStatus(i, f"p{i}", predicted_sigma_mm=4 / (i + 1)) for i in range(8))
+    planned = in_session(idle(), poses=poses, working_distance_m=0.5, floor_mm=0.2)
+    assert "0.5 mm" in told(planned) and "0.2 mm" not in told(planned)
+    assert "1.3 mm" in told(in_session(planned, floor_mm=1.3)), "by a usual arm"
+    estimate = EstimateStatus(4, predicted_error_mm=2.5, floor_mm=2.4, with_more_views_mm=2.49)
+    seen = msgspec.structs.replace(planned, estimate=estimate)
+    assert "± 2.4 mm" in told(seen) and "own 2.4 mm" in told(seen), "by this one's images"
+
+
+def test_of_an_arm_that_tells_no_joints_it_says_what_they_would_win() -> None:
+    posted = in_session(with_robot(idle(), by_hand=True, identity=RobotIdentity("xArm 6")), poses=())
+    silent = with_robot(posted, state=msgspec.structs.replace(posted.robot.state, joints_rad=()))
+    assumed = ARM_CLASSES["industrial-six"].title
+    assert assumed in told(silent) and assumed not in told(posted)
+    assert assumed not in told(with_robot(posted, state=None)), "nobody knows yet what it tells"

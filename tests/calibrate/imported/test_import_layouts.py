@@ -552,6 +552,7 @@ def test_the_question_is_for_programs_too(shots: Shots, tmp_path: Path) -> None:
     answered = call(main, *told, *options[1])
     assert answered.returncode == 0, answered.stderr
     assert any("a/#.png" in line for line in json.loads(answered.stdout)["not_used"])
+    assert not json.loads(answered.stdout)["with_joints"]
 
 
 # ---- pairs without images

@@ -270,6 +270,7 @@ def test_who_the_arm_is_is_kept_as_it_was_told(put: Callable[..., Path], tmp_pat
     folder, out = put(kuka), tmp_path / "mine.mcap"
     told = call(main, "import", folder, "-o", out, "--mount", "eye-in-hand", "--arm-class", "seven-joints")
     assert told.returncode == 0, told.stderr
+    assert "4 mm and 5 mrad" in told.stdout, "what is assumed as no joints are recorded"
     assert open_recording(out).info.robot == RobotIdentity(arm_class="seven-joints")
     out.unlink()
     assert call(main, "import", folder, "-o", out).returncode == 0

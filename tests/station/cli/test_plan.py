@@ -30,6 +30,7 @@ def test_a_plan_is_made_shown_and_saved(made):
     plan = load_plan(file)
     assert len(plan.poses) == 12
     rows = [line for line in result.stdout.splitlines() if line.startswith(tuple(p.name for p in plan.poses))]
+    assert 0.0 < plan.floor_m < plan.predicted_error_m(-1) < plan.predicted_error_m(5)
     assert len(rows) == 12 and all(pose.why[:20] in row for pose, row in zip(plan.poses, rows, strict=True))
 
 

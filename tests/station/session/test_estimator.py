@@ -95,6 +95,11 @@ async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate(
 ) -> None:
     await until(lambda: half_way.session.store.status.estimate.views == BEFORE)
     known = half_way.session.store.status
+    estimate = known.estimate
+    assert 0.0 < estimate.floor_mm < estimate.with_more_views_mm < estimate.predicted_error_mm
+    assert not estimate.enough, "solving asks for more views than these"
+    planned = half_way.session.context.queue.plan
+    assert known.session.floor_mm == pytest.approx(1000 * planned.floor_m, abs=1e-4)
     crash(half_way)
     again = await new_rig(with_plan=False)
     elapsed_s = again.session.store.status.session.elapsed_s

@@ -59,7 +59,7 @@ async def test_views_are_taken_by_themselves_and_taken_back(guided: Rig) -> None
     await until(lambda: store.status.estimate.views == len(stops) and not new_here(rig))
     shown = store.status
     assert len(shown.guidance.outline) == 4 and not shown.guidance.cause
-    assert shown.guidance.after_mm < shown.estimate.predicted_error_mm
+    assert shown.estimate.floor_mm < shown.guidance.after_mm < shown.estimate.predicted_error_mm
     assert shown.guidance.still == 1.0 and not shown.guidance.enough
     await rig.session.edit(1, Skip(len(stops) - 1))
     assert captured(rig) == len(stops) - 1

@@ -249,7 +249,9 @@ def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -
     output = tmp_path / "out.mcap"
     result = call(main, "import", folder, "-o", output, "--json")
     assert result.returncode == 0
-    assert json.loads(result.stdout) == {"recording": str(output), "views": 3, "bytes": output.stat().st_size}
+    size_bytes = output.stat().st_size
+    told = {"recording": str(output), "views": 3, "bytes": size_bytes, "with_joints": False}
+    assert json.loads(result.stdout) == told
     assert json.loads(call(main, "info", output, "--json").stdout)["robot_states"] is None
 
 

@@ -132,13 +132,14 @@ def quick_point(quick: QuickFit, distance_m: float) -> PointPrediction:
     return PointPrediction.of(views.mount, quick.X, views.base_from_flange, distance_m, quick.noise)
 
 
-MOVED_M = 0.006
-"""Spread of the board's position over the views above which it, or the camera, was moved."""
+_MOST = 0.8
+"""Least share of the views that agree; of fewer the board, or the camera, may have been moved."""
 
 
 def gates_would_pass(quick: QuickFit, error: QuickError, joints_known: bool) -> bool:
     """Judge what solving will ask and the quick fit tells already.
 
+    Where many views contradict the others the session is in doubt: the board may have been moved.
     joints_known: the arm's own errors can be learned; else their size is assumed, and nothing fails by it
     alone.
     """
@@ -153,7 +154,7 @@ def gates_would_pass(quick: QuickFit, error: QuickError, joints_known: bool) -> 
         and noise.robot_m <= (limits.robot_error_m or np.inf)
         and np.degrees(noise.robot_rad) <= (limits.robot_error_deg or np.inf)
         and judged_m <= (limits.predicted_error_m or STATION_ERROR_M)
-        and quick.spread_m <= MOVED_M
+        and quick.fit.full.mean() >= _MOST
     )
 
 

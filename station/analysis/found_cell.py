@@ -21,7 +21,6 @@ from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import (
     FEWEST_FOR_CELL,
     FOCAL_SIGMA,
-    MOVED_M,
     QuickFit,
     quick_covariance,
     solve_quickly,
@@ -32,6 +31,8 @@ GOOD_M, GOOD_RAD = 0.010, math.radians(2.0)
 """1σ of the camera's pose below which the views are enough for planning."""
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 0.003, 0.01
 """Smallest 1σ that is stated, because the true arm differs from its nominal table."""
+_MOVED_M = 0.006
+"""Spread of the board's position over the views above which it, or the camera, was moved."""
 _WRONG_SCALE = 0.03
 """Relative deviation of the squares from their stated size above which a warning is given."""
 _OTHER_MOUNT = 3.0
@@ -60,7 +61,7 @@ class FoundCell(QuickFit):
             return StationError("other-mounting")
         if abs(self.scale - 1) > _WRONG_SCALE:
             return StationError("square-size", scale=self.scale)
-        if self.spread_m > MOVED_M:
+        if self.spread_m > _MOVED_M:
             return StationError("board-or-camera-moved", spread_m=self.spread_m)
         return None
 

@@ -149,13 +149,12 @@ def test_an_arm_too_noisy_to_pass_is_never_enough() -> None:
     assert not estimated("eye-in-hand", 25, 3e-3, joints=False).enough
 
 
-def test_a_board_that_was_moved_is_never_enough() -> None:
+@pytest.mark.parametrize(("moved", "enough"), [(1, True), (5, False)])
+def test_one_wrong_view_is_left_out_and_of_many_the_session_is_in_doubt(moved: int, enough: bool) -> None:
     truth, config, _ = cell("eye-in-hand")
-    moved = pose(rotation_exp([0.0, 0.0, 0.1]), np.array([0.05, 0.0, 0.0]))
+    by = pose(rotation_exp([0.0, 0.0, 0.1]), np.array([0.05, 0.0, 0.0]))
     views = [
-        view if view.index < 8 else replace(view, base_from_flange=moved @ view.base_from_flange)
+        replace(view, base_from_flange=by @ view.base_from_flange) if view.index < moved else view
         for view in views_of("eye-in-hand", 15, 3e-5)
     ]
-    capture = msgspec.structs.replace(config.capture, goal_m=0.05)
-    config = msgspec.structs.replace(config, capture=capture)
-    assert not running_estimate(config, truth.camera, True, views).enough
+    assert running_estimate(config, truth.camera, True, views).enough is enough

@@ -74,7 +74,7 @@ def solve(
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of the board detection")] = None,
     gates: GatesFile = None,
     working_distance_mm: Annotated[
-        float | None, typer.Option(min=1.0, max=1e5, help="Distance for predicted error, mm")
+        float | None, typer.Option(min=1.0, max=1e5, help="Distance of the placed point, mm")
     ] = None,
     robot_accuracy_mm: Annotated[
         float | None, typer.Option(min=0.0, help="Arm without joints: its error, 1σ per axis")

@@ -365,7 +365,7 @@ def _regression(calibration: Calibration, before: Calibration | None) -> list[Ga
         point_error_m(one.transform.matrix, np.array(one.covariance), distance_m)
         for one in (calibration, before)
     )
-    title = f"Regression: predicted error at {1e3 * distance_m:.0f} mm"
+    title = f"Regression: error of X at {1e3 * distance_m:.0f} mm"
     remedy = "Capture more or better poses, or keep the installed one."
     if len({one.provenance.software.get("calibration-station") for one in (calibration, before)}) > 1:
         remedy += " Its error was stated by another version: solve its recording again to compare."

@@ -82,7 +82,7 @@ def _first_facts(job: SolvedRecording) -> str:
         "mounting": f"{calibration.mount}, {describe_board(calibration.board)}",
         "views": f"{len(calibration.views.used)} used, {len(calibration.views.rejected)} rejected",
         "installed": "no, when this page was written",
-        "predicted error": "" if error is None else f"{error.value} {error.about}",
+        "placed-point error": "" if error is None else f"{error.value} {error.about}",
     }
     return "\n".join(
         (

@@ -8,6 +8,8 @@ import pytest
 from scipy import stats
 
 from benchmarks.imperfect_cells import Imperfection, imperfect_cell
+from benchmarks.judge.cell import Name, make
+from benchmarks.judge.solver import answer
 from calibrate.handeye import cell_fit, estimate
 from calibrate.handeye.arm import arm_postures, flex_motion, gravity_in_flange
 from calibrate.handeye.cell_fit import fit_cell
@@ -245,3 +247,9 @@ def test_where_no_arm_reaches_a_stated_error_of_orientation_turns_the_flange_abo
 
 def test_sizes_at_which_noise_and_errors_change_places_do_not_undo_the_fit():
     assert solve_views(arm_cell("spherical wrist", "eye-in-hand", 0.3, 2).views, QUICK).fit.arm is not None
+
+
+def test_an_arm_whose_errors_would_reject_nearly_every_view_is_solved_without_them():
+    """A servo arm, eye-to-hand, with joints: its likeliest links would leave too few views for any X."""
+    found = answer(make(Name("clean", "servo arm", "eye-to-hand", joints=True, draw=0, seed=0)))
+    assert not found.refused.startswith("crash")

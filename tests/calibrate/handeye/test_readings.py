@@ -130,6 +130,14 @@ MISREAD = {
 }
 
 
+def test_errors_that_turn_the_positions_by_a_few_degrees_are_no_other_base():
+    """The links of a low-cost arm do so: no frame is taken for another that is so near to it."""
+    c = cell("eye-in-hand")
+    flange = c.views.base_from_flange
+    flange[:, :3, 3] = flange[:, :3, 3] @ rotation_exp([0.0, 0.0, np.radians(4.0)]).T
+    assert Reading.OTHER_BASE not in explained(with_flange(c.views, flange)).readings
+
+
 NUMBERS = {
     # reading: (at, factor), where there is one
     Reading.SHIFTED: (1, 1.0),

@@ -176,7 +176,9 @@ class Explanation:
     log_evidence_gain: float
     """Gain over the recording as it stands."""
     rivals: tuple[Rival, ...] = ()
-    """One of each reading, those with the most evidence first. What is not excluded is named, too."""
+    """One of each reading, those with the most evidence first. What is not excluded is named, too.
+
+    A reading by which the board moves further than as recorded was not fitted and is none of them."""
     at: int = 0
     """Index of the first view after a change; for shifted images, by how many poses."""
     between: tuple[int, int] = (0, 0)

@@ -58,7 +58,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     view_rms_px: float | None = 1.5
     """The rms reprojection error of some view is larger."""
     holdout_share: float | None = None
-    """Held-out views miss by more than this share of the working distance. Not stated: a warning above 1 %."""
+    """Held-out views miss by more than this share of the working distance. Not stated: a warning above
+    1 %."""
     cross_validation: float | None = 1.0
     """Left-out views are missed by more than the stated uncertainty allows by chance."""
     predicted_error_m: float | None = None

@@ -143,8 +143,8 @@ def test_shuffled_poses_cost_hardly_more_than_their_views(share):
     assert not set(bad) & set(solution.evidence.views.used)
     oracle = solve_views(c.views.select([i for i in range(25) if i not in set(bad)]), QUICK)
     assert error_mm_deg(solution.matrix, c.X)[0] < 1.15 * error_mm_deg(oracle.matrix, c.X)[0]
-    gates = {gate.name: gate.passed for gate in judge(solution)}
-    assert gates["weight"] == (share < 0.2)
+    warned = {gate.name for gate in judge(solution) if gate.over_limit}
+    assert ("weight" in warned) == (share > 0.2)
 
 
 def test_forty_percent_of_moderate_errors_stay_inside_the_claim():

@@ -19,8 +19,7 @@ from tests.calibrate.cells import MOUNTS, QUICK, make_cell
 
 @MOUNTS
 def test_the_predicted_sigma_is_the_one_that_the_solver_states(mount):
-    """25 views of a simulated cell, whose arm is told to be exact: their geometry alone says what the estimate
-    will claim."""
+    """25 views of a cell whose arm is told to be exact: geometry alone says what the estimate will claim."""
     noise = MeasurementNoise(0.5, 5e-5, 1e-4)  # robot and corners count alike
     cell = make_cell(np.random.default_rng(4), 25, noise, mount=mount)
     exact = replace(QUICK, intrinsics_from_same_pictures=True, robot_accuracy_m=1e-6)

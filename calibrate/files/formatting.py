@@ -21,6 +21,8 @@ from recordings.schema.messages import BoardSpec, Source
 
 _MOST = 0.8
 """Share of the error above which it is said that no further view lowers it."""
+_WELL_BELOW = 0.5
+"""Share of its limit below which nobody needs to know how the error could be lowered."""
 
 SOURCE_STAMPS: dict[Source, str] = {
     "real": "",
@@ -86,16 +88,17 @@ def accuracy_text(calibration: Calibration) -> str:
     about = f", {about}" if about else ""
     if point is None:
         return f"A point {at} from the camera is right to {value}{about}.{limit}"
-    held = f"95 of 100 points within {point.p95_mm:.2g} mm"
+    value = value.replace("(1σ)", f"(1σ; 95 of 100 points within {point.p95_mm:.2g} mm)")
     told = f"A point {at} from the camera is placed to {value}" if gates else f"Good to {value} at {at}"
-    return f"{told} ({held}){about}.{limit}{_least_text(point)}"
+    well_below = bool(gates) and point.error_mm < _WELL_BELOW * 1e3 * (gates[0].limit or 0.0)
+    return f"{told}{about}.{limit}{'' if well_below else _least_text(point)}"
 
 
 def _least_text(point: PointError) -> str:
     """Say what of the error no calibration lowers, where that is most of it; empty where it is not."""
     if point.floor_mm < _MOST * point.error_mm:
         return ""
-    own = f"{point.floor_mm:.2g} of {point.error_mm:.2g} mm no further view lowers"
+    own = f"{point.floor_mm:.2g} mm of it are left however many views are taken"
     if point.corrected_mm is not None and point.corrected_mm < _MOST * point.error_mm:
         return f" {own}: use the corrected arm ({point.corrected_mm:.2g} mm)."
     advice = "record joints" if point.arm == "assumed" else "have the arm calibrated"

@@ -84,7 +84,8 @@ def link_sizes(arm: ArmPostures, of_class: ArmClass) -> LinkSizes:
     joints = arm.joints_rad if arm.table is None else sample_workspace(arm.table, arm.joints_rad)
     motion = arm.chain.by_links(joints)
     kind = np.arange(motion.shape[2]) % 6
-    by_shifts, by_turns = motion[..., kind < 3], motion[..., kind >= 3]
+    by_shifts = motion[..., kind < 3]
+    by_turns = motion[..., kind >= 3]
     position_by_shifts = _mean_square(by_shifts[:, :3])
     position_by_turns = _mean_square(by_turns[:, :3])
     turn = of_class.turn_rad / np.sqrt(_mean_square(by_turns[:, 3:]))

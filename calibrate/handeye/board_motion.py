@@ -78,7 +78,8 @@ def pairs_moves_m(H: Array, C: Array, size_known: bool) -> Array:
     U, _, Vt = np.linalg.svd(alpha.T @ beta)
     R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
     shift = B[:, :3, 3] @ R.T
-    J, right = A[:, :3, :3] - np.eye(3), shift - A[:, :3, 3]
+    J = A[:, :3, :3] - np.eye(3)
+    right = shift - A[:, :3, 3]
     if not size_known:
         J, right = np.concatenate([J, -shift[..., None]], axis=2), -A[:, :3, 3]
     t = np.linalg.lstsq(J.reshape(-1, J.shape[2]), right.ravel(), rcond=None)[0]

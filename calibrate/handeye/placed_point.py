@@ -88,8 +88,12 @@ class PlacedPoint:
 
     def mean_square(self, covariance: Array, noise: Array) -> float:
         """Average |e|², m²; `covariance` and `noise` as in `KnownErrors`."""
+        return self.systematic() + self.by_uncertainty(covariance) + self.by_chance(noise)
+
+    def by_uncertainty(self, covariance: Array) -> float:
+        """Average |e|², m², by what is uncertain of [X, errors] alone."""
         K = np.einsum("mik,mil->kl", self.by_unknown, self.by_unknown) / len(self.mean)
-        return self.systematic() + float(np.sum(K * covariance)) + self.by_chance(noise)
+        return float(np.sum(K * covariance))
 
     def systematic(self) -> float:
         """Average |e|², m², by the means alone: known, and yet in every point."""
@@ -167,7 +171,8 @@ class PointPrediction:
 def _in_hand(at: Postures, known: KnownErrors, installed: Array, p: Array) -> PlacedPoint:
     n = len(at.flange)
     first, second = np.nonzero(~np.eye(n, dtype=bool)) if n > 1 else (np.zeros(1, int), np.zeros(1, int))
-    R, t = at.flange[:, :3, :3], at.flange[:, :3, 3]
+    R = at.flange[:, :3, :3]
+    t = at.flange[:, :3, 3]
     seen = t + R @ (installed[:3, :3] @ p + installed[:3, 3])  # (n, 3) the point, by the installed X
     by_X = R @ _moves_point(known.X, p)
     placed = _lever(seen[first] - t[second])

@@ -11,14 +11,13 @@ from calibrate.handeye.arm import FLEX, ArmPostures, flex_motion, gravity_in_fla
 from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.estimate import Estimate
+from calibrate.handeye.information import MORE_VIEWS
 from calibrate.handeye.placed_point import KnownErrors, PlacedPoint, Postures
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.handeye.workspace import sample_range, sample_workspace
 from calibrate.results import PointError
 from recordings.geometry import Array
 
-_MORE_VIEWS = 10
-"""Views more that are asked what they would lower."""
 _ENDLESS = 1e6
 """Times that every view is repeated where only what no view can lower is to be left."""
 
@@ -67,8 +66,8 @@ def state_point(
     lens_and_board = _taken_by(found, [Layout.of(found.state).lens, Layout.of(found.state).shape])
     left = known.covariance - told - lens_and_board
     arm_only = _explained(left, slice(6, len(left)))
-    by_lens_and_board = at_recorded.mean_square(lens_and_board, np.zeros(2)) - at_recorded.systematic()
-    by_x = at_recorded.mean_square(left - arm_only, np.zeros(2)) - at_recorded.systematic()
+    by_lens_and_board = at_recorded.by_uncertainty(lens_and_board)
+    by_x = at_recorded.by_uncertainty(left - arm_only)
     by_arm = square - by_lens_and_board - by_x
     return PointError(
         error_mm=_mm(square),
@@ -79,7 +78,7 @@ def state_point(
         from_arm_mm=_mm(by_arm),
         from_board_lens_mm=_mm(by_lens_and_board),
         floor_mm=_mm(with_views_times(_ENDLESS)),
-        with_more_views_mm=_mm(with_views_times(1 + _MORE_VIEWS / used)),
+        with_more_views_mm=_mm(with_views_times(1 + MORE_VIEWS / used)),
         arm="told" if fit.accuracy_told else basis.arm,
         arm_class="" if basis.arm != "assumed" or fit.accuracy_told else fit.of_class.name,
         corrected_mm=corrected_mm,

@@ -96,7 +96,8 @@ def test_a_class_that_does_not_exist_is_refused_with_the_choices() -> None:
 
 
 def test_an_unknown_arm_is_the_wider_of_the_industrial_ones() -> None:
-    unknown, industrial = ARM_CLASSES[UNKNOWN], [ARM_CLASSES[name] for name in INDUSTRIAL]
+    unknown = ARM_CLASSES[UNKNOWN]
+    industrial = [ARM_CLASSES[name] for name in INDUSTRIAL]
     for figure in ("shift_m", "turn_rad", "repeatability_m"):
         assert getattr(unknown, figure) == max(getattr(one, figure) for one in industrial)
 

@@ -71,7 +71,8 @@ def placed(
     errors = []
     for _ in range(400):
         a, b = rng.choice(len(flanges), 2, replace=False)
-        told_a, told_b = flanges[a], flanges[b]
+        told_a = flanges[a]
+        told_b = flanges[b]
         true_a, true_b = (perturb(told, rng.normal(0, noise, 6)) for told in (told_a, told_b))
         if mount == "eye-in-hand":
             seen, stands = told_a @ found, true_a @ true

@@ -81,7 +81,8 @@ def pairs_moves_m(H: Array, C: Array, size_known: bool) -> Array:
     J = A[:, :3, :3] - np.eye(3)
     right = shift - A[:, :3, 3]
     if not size_known:
-        J, right = np.concatenate([J, -shift[..., None]], axis=2), -A[:, :3, 3]
+        J = np.concatenate([J, -shift[..., None]], axis=2)
+        right = -A[:, :3, 3]
     t = np.linalg.lstsq(J.reshape(-1, J.shape[2]), right.ravel(), rcond=None)[0]
     turned = np.linalg.norm(alpha - beta @ R.T, axis=1)
     return np.asarray(np.linalg.norm(J @ t - right, axis=1) + _LEVER_M * turned)

@@ -38,7 +38,7 @@ from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.cell.config import StationConfig, matrix4
 from station.cell.layout import board_place
-from station.cell.status import EstimateStatus
+from station.cell.status import WORTH_TEN_VIEWS, EstimateStatus
 from station.plan.visibility import count_in_parts
 
 FEWEST_FOR_CELL, FEWEST_FOR_ESTIMATE = 3, 4
@@ -83,10 +83,6 @@ def running_estimate(
     )
 
 
-LITTLE = 0.05
-"""Share of the error below which it is not worth to take ten more views for it."""
-
-
 @dataclass(frozen=True)
 class QuickError:
     """The error of a placed point by the views so far, metres."""
@@ -105,7 +101,7 @@ class QuickError:
         """Tell whether the goal is reached, or is beyond the arm, and more views hardly lower the error."""
         if self.error_m <= goal_m:
             return True
-        return self.floor_m > goal_m and self.with_more_views_m > (1.0 - LITTLE) * self.error_m
+        return self.floor_m > goal_m and self.with_more_views_m > (1.0 - WORTH_TEN_VIEWS) * self.error_m
 
 
 def quick_error(quick: QuickFit, board: BoardSpec, free_lens: bool) -> QuickError:

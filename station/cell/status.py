@@ -183,6 +183,10 @@ class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Pulses so far; the frames that belong to them: `CameraCounts.paired`"""
 
 
+WORTH_TEN_VIEWS = 0.05
+"""Share of the placed-point error that ten more views have to lower to be worth taking."""
+
+
 class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Running estimate after each pose, not the result of the session."""
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-_LITTLE = 0.05
-"""Share of the error below which ten more views are not said to lower it."""
+from station.cell.status import WORTH_TEN_VIEWS
 
 
 def above_goal(
@@ -20,6 +19,10 @@ def above_goal(
     if floor_mm is None or goal_mm is None or floor_mm <= goal_mm:
         return ""
     above = f"the arm's own {floor_mm:.2g} mm is above your goal of {goal_mm:g} mm"
-    if error_mm is None or with_more_views_mm is None or with_more_views_mm > (1.0 - _LITTLE) * error_mm:
+    if (
+        error_mm is None
+        or with_more_views_mm is None
+        or with_more_views_mm > (1.0 - WORTH_TEN_VIEWS) * error_mm
+    ):
         return f"{above}: more poses do not help"
     return f"{above}: ten more poses lower {error_mm:.2g} mm to {with_more_views_mm:.2g} mm"

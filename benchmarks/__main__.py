@@ -32,6 +32,7 @@ SHOWN: dict[str, str] = {
     "any_arm": r"^\| seven joints",
     "mistakes": r"^\*\*",
     "misread_poses": r"^\*\*",
+    "moved": r"^\| (nothing|board|camera) \| \d \| swept",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
     "library_cpu": r"^\| 25",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",

@@ -17,7 +17,7 @@ from scipy import special
 from calibrate.handeye.arm import FLEX
 from calibrate.handeye.assumed_arm import LinkSizes
 from calibrate.handeye.cell_state import CellState
-from calibrate.handeye.estimate import Estimate, MixtureParts, estimate
+from calibrate.handeye.estimate import NEARLY_SETTLED, Estimate, MixtureParts, estimate
 from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import Priors
@@ -119,7 +119,7 @@ def estimate_with_arm_errors(
     alike = {one: solve(sizes.sigma(one), plain.scales) for one in sizes.alike}
     likeliest = max(alike, key=lambda one: sizes.log_chance(one) + alike[one].log_evidence)
     scales = replace(alike[likeliest].scales, arm_error_sigma=sizes.sigma(likeliest))
-    settled = estimate(observed, state, priors, scales, fit="robot")
+    settled = estimate(observed, state, priors, scales, fit="robot", settled=NEARLY_SETTLED)
     linear = Linear.at(observed, settled.state, settled.corner_weights)
     solve = partial(_solve, linear, priors, settled.state)
     kept, solutions, log_joint = _explore(sizes, solve, settled.scales)

@@ -125,6 +125,18 @@ def _posture(flange: Array) -> tuple[Array, NDArray[np.bool_]]:
     return posture, near
 
 
+def _compressed(errors: Array) -> Array:
+    """Return errors (n, 6, r) with r ≤ 6n that move the views as these (n, 6, q) do.
+
+    All have the same 1σ, so that a rotation of them changes nothing (singular value decomposition).
+    """
+    n, _, q = errors.shape
+    if q <= 6 * n:
+        return errors
+    U, values, _ = np.linalg.svd(errors.reshape(6 * n, q), full_matrices=False)
+    return np.asarray(U * values).reshape(n, 6, -1)
+
+
 @dataclass(frozen=True, eq=False)
 class _State:
     """Values of the unknowns on one side of a change."""
@@ -170,8 +182,8 @@ class _Weighed:
     """Log evidence at each place."""
     log_step: float
     """Log evidence, at the best place, of a step as large as the arm's other errors."""
-    log_none: float
-    """Log evidence of no change."""
+    scales: Scales
+    """Noise of the robot beside the likeliest change."""
     apart: Array
     agrees: bool
     """Enough views before and after have ordinary noise."""
@@ -197,7 +209,7 @@ class ChangeSearch:
         joints_known: the errors hold those of the arm's links, which follow its configuration.
         """
         self._views = views
-        self._errors = errors
+        self._errors = _compressed(errors)
         self._seed = seed
         self._joints_known = joints_known
         self._fit = as_recorded
@@ -205,6 +217,7 @@ class ChangeSearch:
         self._linear = self._linearised(state)
         self._priors = [self._prior(state.factors, size) for size in _SIZES]
         scales = as_recorded.solved.scales
+        self._fitted: dict[tuple[Reading, int], _Weighed | None] = {}
         self._none = [self._linear.solve(prior, scales, "robot", _ROUNDS) for prior in self._priors]
 
     def found(self) -> list[Change]:
@@ -222,7 +235,7 @@ class ChangeSearch:
             weighed = [one for at in dict.fromkeys(tried) if (one := self._weighed(kind, at))]
             if weighed:
                 found[kind] = max(weighed, key=lambda one: special.logsumexp(one.logs))
-        rivals = [one.log_none for one in found.values()]
+        rivals = [self._log_none([one.scales for one in found.values()])]
         if not self._joints_known:
             rivals += [one.log_step - np.log(len(self._places)) for one in found.values()]
         return [self._change(kind, one, len(kinds), max(rivals)) for kind, one in found.items()]
@@ -234,7 +247,7 @@ class ChangeSearch:
         errors is too sure. Sizes of the errors are weighed by their evidence.
         """
         factors = self._fit.factors[0] + np.array([one.step[_BOARD_SIZE] for one in self._none])
-        variances = np.array([np.linalg.inv(one.precision)[_BOARD_SIZE, _BOARD_SIZE] for one in self._none])
+        variances = np.array([(one.inverse.root[_BOARD_SIZE] ** 2).sum() for one in self._none])
         weights = special.softmax([one.log_evidence for one in self._none])
         factor = float(weights @ factors)
         return factor, float(np.sqrt(weights @ (variances + (factors - factor) ** 2)))
@@ -307,14 +320,18 @@ class ChangeSearch:
         """Weigh a change near `at` over all its places; None where too few views agree with it."""
         weighed = None
         for _ in range(_MOST_FITS):
-            sides = self._sides(kind, at)
-            if sides is None:
-                return None
-            weighed = self._by_place(sides, at)
-            if weighed.best == at:
+            weighed = self._fitted_at(kind, at)
+            if weighed is None or weighed.best == at:
                 break
             at = weighed.best
         return weighed if weighed is not None and weighed.agrees else None
+
+    def _fitted_at(self, kind: Reading, at: int) -> _Weighed | None:
+        """Fit a change before view `at` and weigh it at each place near; once, however often it is asked."""
+        if (kind, at) not in self._fitted:
+            sides = self._sides(kind, at)
+            self._fitted[kind, at] = None if sides is None else self._by_place(sides, at)
+        return self._fitted[kind, at]
 
     def _change(self, kind: Reading, weighed: _Weighed, kinds: int, log_rival: float) -> Change:
         """Hold a change against the best of its rivals."""
@@ -356,15 +373,14 @@ class ChangeSearch:
             for one, size in zip(solved, _SIZES, strict=True)
         ]
         log_step = float(special.logsumexp(steps) - np.log(len(steps)))
-        log_none = self._log_none(likeliest.scales)
-        return _Weighed(places, by_place, log_step, log_none, sides.apart, bool(agrees))
+        return _Weighed(places, by_place, log_step, likeliest.scales, sides.apart, bool(agrees))
 
-    def _log_none(self, scales: Scales) -> float:
-        """Log evidence of no change, the sizes averaged, from the noise without and with a change."""
-        again = [self._linear.solve(prior, scales, "robot", _ROUNDS) for prior in self._priors]
-        logs = [
-            max(one.log_evidence, other.log_evidence) for one, other in zip(self._none, again, strict=True)
-        ]
+    def _log_none(self, starts: list[Scales]) -> float:
+        """Log evidence of no change, the sizes averaged: the most from the noise without and with changes."""
+        logs = np.array([one.log_evidence for one in self._none])
+        for scales in starts:
+            again = [self._linear.solve(prior, scales, "robot", _ROUNDS) for prior in self._priors]
+            logs = np.maximum(logs, [one.log_evidence for one in again])
         return float(special.logsumexp(logs) - np.log(len(logs)))
 
     @property
@@ -435,16 +451,22 @@ def _with_change(prior: Quadratic, size: int) -> Quadratic:
 def _log_of_change(solved: LinearSolution, apart: Array) -> float:
     """Compute the log evidence of a solution whose last unknowns are a change, beside `apart` (d,)."""
     d = len(apart)
-    covariance = np.linalg.inv(solved.precision)[-d:, -d:]
+    covariance = _of_last(solved, d)
     return solved.log_evidence + float(_by_sizes(apart + solved.step[-d:], covariance))
 
 
 def _log_of_step(solved: LinearSolution, apart: Array, sigma: float) -> float:
     """Compute the same for a step, beside `apart` (6,), whose parts have this 1σ (metres, radians)."""
-    covariance = np.linalg.inv(solved.precision)[-_POSE:, -_POSE:] + sigma**2 * np.eye(_POSE)
+    covariance = _of_last(solved, _POSE) + sigma**2 * np.eye(_POSE)
     step = apart + solved.step[-_POSE:]
     square = float(step @ np.linalg.solve(covariance, step))
     return solved.log_evidence - 0.5 * (square + float(np.linalg.slogdet(covariance)[1]))
+
+
+def _of_last(solved: LinearSolution, d: int) -> Array:
+    """Return the covariance (d, d) of the last unknowns of a solution."""
+    root = solved.inverse.root[-d:]
+    return root @ root.T
 
 
 def _by_sizes(change: Array, covariance: np.ndarray) -> Array:

@@ -82,7 +82,7 @@ class CornerModes:
         return max(rest, 0.0), max(freedom, 0.0)
 
     def variances(self, lambda_px: float, covariance: Array, step: Array) -> tuple[float, float]:
-        """Estimate σ² and λ² (px²) after a step (G,) with this covariance (G, G).
+        """Estimate σ² and λ² (px²) after a step (G,) with this covariance (g, g) of lens and shape.
 
         λ² are the squares that each view alone could still win by a lens and shape of its own, over the
         number of these modes less those that the common lens and shape used up. σ has a prior about λ, as λ
@@ -91,8 +91,7 @@ class CornerModes:
         rest, freedom = self._rest
         sigma2 = max((rest + MODE_COUNT * lambda_px**2) / (freedom + MODE_COUNT), 1e-8)
         after = self.free.right - self.free.information @ step[self.shared]
-        part = covariance[self.shared, self.shared]
-        used = float(np.einsum("ij,ji", part, self.information)) / lambda_px**2
+        used = float(np.einsum("ij,ji", covariance, self.information)) / lambda_px**2
         rank = self._whitening[1]
         lambda2 = (self._own_decrease(after) + MODE_COUNT * sigma2) / max(rank - used + MODE_COUNT, 1.0)
         return sigma2, max(lambda2, sigma2)

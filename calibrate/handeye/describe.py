@@ -22,7 +22,7 @@ from calibrate.handeye.diagnosis import (
     judge_board,
     judge_lens,
 )
-from calibrate.handeye.estimate import FULL, estimate
+from calibrate.handeye.estimate import FULL, NEARLY_SETTLED, estimate
 from calibrate.handeye.metrics import (
     FEWEST_FITTED,
     HELD_OUT,
@@ -272,7 +272,7 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
     whole = fit.estimate
     try:
         start = replace(whole.state, C=whole.state.C[first])
-        partial = estimate(fit.observed.part(first), start, fit.priors, whole.scales)
+        partial = estimate(fit.observed.part(first), start, fit.priors, whole.scales, settled=NEARLY_SETTLED)
     except BadViewsError:
         return None
     H = mount_poses(fit.views.base_from_flange, fit.views.mount)[last]

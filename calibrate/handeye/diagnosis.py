@@ -10,7 +10,7 @@ from scipy import special
 from calibrate.errors import BadViewsError
 from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
-from calibrate.handeye.estimate import FULL, estimate
+from calibrate.handeye.estimate import FULL, NEARLY_SETTLED, estimate
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.solution import Finding
@@ -192,7 +192,7 @@ def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
     others = np.setdiff1d(np.arange(len(fit.views)), left_out)
     whole = fit.estimate
     start = replace(whole.state, C=whole.state.C[others])
-    found = estimate(fit.observed.part(others), start, fit.priors, whole.scales)
+    found = estimate(fit.observed.part(others), start, fit.priors, whole.scales, settled=NEARLY_SETTLED)
     seen = replace(found.state, C=whole.board_poses[left_out])
     linear = Linear.at(fit.observed.part(left_out), seen, whole.corner_weights[left_out])
     return linear.m, linear.predicted(found.scales, found.covariance)

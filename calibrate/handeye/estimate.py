@@ -27,8 +27,11 @@ REJECTED = 0.05
 the ordinary one (the first two classes of `mixture.GAIN`)."""
 FULL = 0.35
 """Probability of the class of ordinary noise above which a view counts fully."""
-_SETTLED = 0.01
+SETTLED = 0.01
 """Step length, in sigmas of all unknowns together, below which the iteration has converged."""
+NEARLY_SETTLED = 0.1
+"""The same for a part of the views, which is fitted only to predict the others: a tenth of a sigma is not
+seen in how far these are missed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +109,12 @@ def estimate(
     scales: Scales | None = None,
     wide: float = WIDE,
     fit: Fit = "all",
+    settled: float = SETTLED,
 ) -> Estimate:
     """Find the maximum of the posterior from `start`.
 
     scales: the noise to start from, of which `fit` says what is fitted; None: from the residuals at `start`,
-    the robot's times `wide`.
+    the robot's times `wide`. settled: step length, in sigmas, below which it ends.
     Raises BadViewsError where views and priors together do not determine the unknowns.
     """
     state, converged = start, False
@@ -123,7 +127,7 @@ def estimate(
             scales = solved.scales
             state = state.moved(solved.step, linear.board_step(solved))
             weights = corner_weights(observed, state, scales.sigma_px)
-            converged = bool(solved.step @ solved.precision @ solved.step < _SETTLED**2)
+            converged = bool(solved.step @ solved.precision @ solved.step < settled**2)
             linear = Linear.at(observed, state, weights)
             if converged:
                 break

@@ -17,7 +17,7 @@ from calibrate.handeye.corner_modes import INFORMATION, CornerModes
 from calibrate.handeye.mixture import SHARE_COUNTS, class_chances, expected
 from calibrate.handeye.noise_scales import WIDE, Scales, update_corners, update_robot
 from calibrate.handeye.reprojection import linearise_corners
-from calibrate.handeye.uncertainty import information_lost, inverse_of
+from calibrate.handeye.uncertainty import Inverse, information_lost, inverse_of
 from calibrate.views.view_set import Observations
 from recordings.geometry import Array, perturb
 
@@ -25,6 +25,9 @@ ROUNDS = 8
 """Rounds of expectation and maximisation at one linearisation; the next linearisation goes on with them."""
 MAX_STEPS = 15
 """Most linearisations of a fit."""
+_SETTLED = 1e-3
+"""Relative change of a scale by one round below which the rounds end. Where a round takes off a twentieth of
+what is left to go, two hundredths are left then: evidence is flat there, and differs by hundredths."""
 Fit = Literal["all", "robot", "nothing"]
 """Which noise scales are fitted."""
 
@@ -37,6 +40,8 @@ class LinearSolution:
     """(G,) in the order of `Layout`."""
     precision: Array
     """(G, G) information, as if the present class probabilities were known."""
+    inverse: Inverse
+    """Of `precision`."""
     W: Array
     """(n, 6, 6) information of each residual."""
     scales: Scales
@@ -108,7 +113,10 @@ class Linear:
     def solve(
         self, prior: Quadratic, scales: Scales, fit: Fit = "all", rounds: int = ROUNDS
     ) -> LinearSolution:
-        """Find the step and the noise scales to be fitted, by rounds of expectation and maximisation."""
+        """Find the step and the noise scales to be fitted, by rounds of expectation and maximisation.
+
+        rounds: the most. A round that changes no scale of the noise by more than `_SETTLED` is the last.
+        """
         residual, modes = self.m, self.modes
         for _ in range(1 if fit == "nothing" else rounds):
             S, S_inverse = self.noise(scales)
@@ -120,24 +128,26 @@ class Linear:
             if modes is not None:
                 N[modes.shared, modes.shared] += modes.information / scales.lambda_px**2
                 right[modes.shared] += modes.right / scales.lambda_px**2
-            covariance = inverse_of(N)
-            step = covariance @ right
+            inverse = Inverse.of(N)
+            step = inverse.times(right)
             residual = self.m + self.J @ step
             z = np.einsum("nkij,nj->nki", S_inverse, residual)
             if fit != "nothing":
-                P = S_inverse - S_inverse @ self._seen(covariance)[:, None] @ S_inverse
-                before, scales = scales, update_robot(scales, chances, z, P)
+                P = S_inverse - S_inverse @ self._seen(inverse.root)[:, None] @ S_inverse
+                before = scales
+                scales = update_robot(scales, chances, z, P)
                 if fit == "all" and modes is not None:
-                    sigma2, lambda2 = modes.variances(before.lambda_px, covariance, step)
+                    root = inverse.root[modes.shared]
+                    sigma2, lambda2 = modes.variances(before.lambda_px, root @ root.T, step)
                     scales = update_corners(scales, chances, z, P, self.V, sigma2, lambda2)
+                if _has_settled(before, scales):
+                    break
         _, log_density = class_chances(residual, S, S_inverse, scales.shares)
         # Quadratic in the step, so its gain over the point of linearisation is right·step - ½ step·N·step.
-        evidence = (
-            float(log_density.sum()) + prior.log + prior.gain(step) - 0.5 * float(np.linalg.slogdet(N)[1])
-        )
+        evidence = float(log_density.sum()) + prior.log + prior.gain(step) - 0.5 * inverse.log_determinant
         if modes is not None:
             evidence -= modes.cost(step) / scales.lambda_px**2
-        return LinearSolution(step, N, W, scales, chances, residual, z, evidence)
+        return LinearSolution(step, N, inverse, W, scales, chances, residual, z, evidence)
 
     def noise(self, scales: Scales) -> tuple[Array, Array]:
         """Compute the covariances (n, K, 6, 6) of m for each class, and their inverses."""
@@ -176,12 +186,13 @@ class Linear:
     def predicted(self, scales: Scales, covariance: Array) -> Array:
         """Predict the covariance (n, 6, 6) of m for ordinary views outside the fit of `covariance` (G, G)."""
         noise = scales.tau_px**2 * self.V + np.diag(scales.classes[0])
-        return np.asarray(noise + self._seen(covariance))
+        return np.asarray(noise + self.J @ covariance @ np.swapaxes(self.J, 1, 2))
 
-    def _seen(self, covariance: Array) -> Array:
-        """Compute the covariance (n, 6, 6) of m by that of the shared unknowns (G, G)."""
-        rows = self.J.reshape(-1, len(covariance))  # one product is twice as fast as one for each view
-        return np.asarray((rows @ covariance).reshape(self.J.shape) @ np.swapaxes(self.J, 1, 2))
+    def _seen(self, root: Array) -> Array:
+        """Compute the covariance (n, 6, 6) of m by that of the shared unknowns, R Rᵀ with `root` R (G, G)."""
+        rows = self.J.reshape(-1, len(root)) @ root  # one product is twice as fast as one for each view
+        by_view = rows.reshape(self.J.shape)
+        return np.asarray(by_view @ np.swapaxes(by_view, 1, 2))
 
     def noise_parts(self, solved: LinearSolution, covariance: Array) -> Array:
         """Compute X's variance (3,) by the noise of corners, robot translation and robot rotation.
@@ -193,6 +204,13 @@ class Linear:
         sources = (solved.scales.tau_px**2 * self.V, m, rad)
         parts = [(gain @ source @ np.swapaxes(gain, 1, 2)).sum(axis=0) for source in sources]
         return np.array([float(np.trace(np.linalg.solve(covariance[:6, :6], part))) for part in parts])
+
+
+def _has_settled(before: Scales, after: Scales) -> bool:
+    """Tell whether a round changed neither noise nor shares of the classes, the corners' noise included."""
+    first = np.array([*before.robot, before.tau_px, before.lambda_px, before.sigma_px, *before.shares])
+    second = np.array([*after.robot, after.tau_px, after.lambda_px, after.sigma_px, *after.shares])
+    return bool((np.abs(second - first) <= _SETTLED * first).all())
 
 
 def _summed(J: Array, WJ: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from recordings.geometry import Array
@@ -12,27 +14,61 @@ _WELL_DETERMINED = 1e-11
 """Reciprocal condition from which a Cholesky factor inverts a matrix accurately, ten times as fast."""
 
 
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """The inverse of a symmetric positive matrix N (g, g), kept as a root R: N⁻¹ = R Rᵀ."""
+
+    root: Array
+    """(g, g) R"""
+    log_determinant: float
+    """Of N."""
+
+    @classmethod
+    def of(cls, N: Array) -> Inverse:
+        """Factorise N, scaled to ones first. LinAlgError where it is not positive.
+
+        A direction that is undetermined up to rounding (two terms of a rational lens, say) gets a huge
+        variance, not an infinite one.
+        """
+        from scipy.linalg import eigh, lapack  # a fifth of the start of a daemon, whose worker alone inverts
+
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+        log_scale = float(np.log(scale).sum())
+        scaled = N * scale[:, None] * scale
+        factor, failed = lapack.dpotrf(scaled, lower=True)
+        if not failed and _is_accurate(factor, scaled):
+            inverted = lapack.dtrtri(factor, lower=True)[0]
+            log_determinant = 2.0 * (float(np.log(factor.diagonal()).sum()) - log_scale)
+            return cls(scale[:, None] * inverted.T, log_determinant)
+        # Not divide and conquer: it fails for about one matrix in a thousand.
+        values, vectors = eigh((scaled + scaled.T) / 2, driver="ev", check_finite=False)
+        if not values[0] > -_ROUNDING:
+            raise np.linalg.LinAlgError("some unknowns are left open")
+        values = np.maximum(values, _ROUNDING)
+        log_determinant = float(np.log(values).sum()) - 2.0 * log_scale
+        return cls(vectors * scale[:, None] / np.sqrt(values), log_determinant)
+
+    @property
+    def matrix(self) -> Array:
+        """(g, g) N⁻¹"""
+        return np.asarray(self.root @ self.root.T)
+
+    def times(self, right: Array) -> Array:
+        """Compute N⁻¹ (g, g) times `right` (g,)."""
+        return np.asarray(self.root @ (right @ self.root))
+
+
+def _is_accurate(factor: Array, scaled: Array) -> bool:
+    """Tell whether a lower Cholesky factor inverts `scaled` accurately."""
+    from scipy.linalg import lapack
+
+    norm = np.abs(scaled).sum(axis=0).max()
+    return bool(lapack.dpocon(factor, norm, uplo="L")[0] > _WELL_DETERMINED)
+
+
 def inverse_of(N: Array) -> Array:
-    """Invert a symmetric positive matrix, scaled to ones first. LinAlgError where it is not.
-
-    A direction that is undetermined up to rounding (two terms of a rational lens, say) gets a huge variance,
-    not an infinite one.
-    """
-    from scipy.linalg import eigh, lapack  # a fifth of the start of a daemon, whose worker alone inverts
-
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
-    scaled = (N + N.T) / 2 * np.outer(scale, scale)
-    factor, failed = lapack.dpotrf(scaled)
-    if not failed and lapack.dpocon(factor, np.abs(scaled).sum(axis=0).max())[0] > _WELL_DETERMINED:
-        half = lapack.dpotri(factor)[0]  # its lower part is zero
-        np.fill_diagonal(half, half.diagonal() / 2)
-        return np.asarray((half + half.T) * np.outer(scale, scale))
-    # Not divide and conquer: it fails for about one matrix in a thousand.
-    values, vectors = eigh(scaled, driver="ev", check_finite=False)
-    if not values[0] > -_ROUNDING:
-        raise np.linalg.LinAlgError("some unknowns are left open")
-    root = vectors * scale[:, None]
-    return np.asarray((root / np.maximum(values, _ROUNDING)) @ root.T)
+    """Invert a symmetric positive matrix, as `Inverse.of` does. LinAlgError where it is not positive."""
+    return Inverse.of(N).matrix
 
 
 def information_lost(chances: Array, z: Array, W: Array) -> Array:

@@ -26,8 +26,8 @@ ROUNDS = 8
 MAX_STEPS = 15
 """Most linearisations of a fit."""
 _SETTLED = 1e-3
-"""Relative change of a scale by one round below which the rounds end. Where a round takes off a twentieth of
-what is left to go, two hundredths are left then: evidence is flat there, and differs by hundredths."""
+"""Relative change of every scale by one round below which the rounds end. The scales may then be some percent
+from where they would end, and the evidence, which is flat there, some hundredths."""
 Fit = Literal["all", "robot", "nothing"]
 """Which noise scales are fitted."""
 

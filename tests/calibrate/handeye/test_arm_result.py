@@ -15,7 +15,7 @@ from calibrate.arms.kinematics import MODELS, forward, with_near_axes
 from calibrate.handeye.arm_table import CorrectedArm
 from calibrate.handeye.solution import Solution, UncorrectedArm
 from calibrate.handeye.solve import solve_views
-from calibrate.handeye.uncertainty import inverse_of
+from calibrate.handeye.uncertainty import Inverse, inverse_of
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.pipeline.solved import Solved
 from recordings.geometry import Array, difference, inverse, perturb, pose
@@ -183,3 +183,19 @@ def test_the_quick_and_the_careful_inverse_agree(monkeypatch: pytest.MonkeyPatch
 def test_what_has_no_inverse_is_said_as_such(N: Array) -> None:
     with pytest.raises(np.linalg.LinAlgError):
         inverse_of(N)
+
+
+@pytest.mark.parametrize("careful_below", [1e-11, 1.0])
+def test_an_inverse_keeps_a_root_and_the_determinant(
+    monkeypatch: pytest.MonkeyPatch, careful_below: float
+) -> None:
+    monkeypatch.setattr("calibrate.handeye.uncertainty._WELL_DETERMINED", careful_below)
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(6, 6))
+    scale = np.array([1e3, 1.0, 1e2, 1e-3, 1.0, 1.0])
+    N = scale[:, None] * (A @ A.T) * scale
+    found = Inverse.of(N)
+    unknowns = np.arange(6.0)
+    np.testing.assert_allclose(found.root @ found.root.T @ N, np.eye(6), atol=1e-6)
+    np.testing.assert_allclose(found.times(N @ unknowns), unknowns, atol=1e-6)
+    np.testing.assert_allclose(found.log_determinant, np.linalg.slogdet(N)[1], rtol=1e-9)

@@ -203,7 +203,8 @@ class PointError(msgspec.Struct, frozen=True, omit_defaults=True):
     p95_mm: float
     """Distance within which 95 of 100 points are placed."""
     workspace_mm: float
-    """As `error_mm`, at postures all over the arm's workspace, or the range of its joints."""
+    """As `error_mm`, elsewhere in the workspace: joint 1 anywhere, each other joint in its recorded range and
+    half a radian beyond, the flange no farther from the point than at the recorded postures."""
     from_x_mm: float
     """Part of the noise of corners and robot in the views, by X."""
     from_arm_mm: float

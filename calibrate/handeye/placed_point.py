@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.handeye.noise_scales import MeasurementNoise
 from recordings.geometry import Array, difference, skew
@@ -41,11 +42,6 @@ class Postures:
     by_bracket: Array
     """(n, 6, b) motion, in base, of what a bending bracket carries: eye-in-hand the camera, and no tool;
     eye-to-hand the board, which has no part in the error."""
-
-    def thinned(self, most: int = MOST_POSTURES) -> Postures:
-        """Keep at most so many, evenly spread."""
-        some = np.unique(np.linspace(0, len(self.flange) - 1, min(len(self.flange), most)).astype(np.intp))
-        return Postures(self.flange[some], self.by_arm[some], self.by_bracket[some])
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,14 +73,29 @@ class PlacedPoint:
 
     @classmethod
     def of(
-        cls, mount: Mount, known: KnownErrors, installed: Array, distance_m: float, postures: Postures
+        cls,
+        mount: Mount,
+        known: KnownErrors,
+        installed: Array,
+        distance_m: float,
+        postures: Postures,
+        tool_m: float | None = None,
     ) -> PlacedPoint:
-        """Linearise for pairs of all `postures` (one with itself left out) and X̂ = `installed` (4, 4)."""
-        at = postures.thinned()
+        """Linearise for pairs of `postures` and X̂ = `installed` (4, 4).
+
+        tool_m: how far from the flange the tool ends. A point is placed from those postures whose flange is
+        no farther than that from it, and where there is none, from the nearest. None: recorded postures, of
+        which each pair counts but one with itself.
+        """
         p = np.array([0.0, 0.0, distance_m])
-        if mount == "eye-in-hand":
-            return _in_hand(at, known, installed, p)
-        return _fixed(at, known, installed, p)
+        seen = points_seen(mount, installed, distance_m, postures.flange)
+        in_hand = mount == "eye-in-hand"
+        if in_hand and tool_m is None:
+            pairs = _Pairs.of_recorded(len(seen))
+        else:
+            pairs = _Pairs.within(tool_m or np.inf, seen, postures.flange[:, :3, 3])
+        make = _in_hand if in_hand else _fixed
+        return make(postures, pairs, seen, known, installed, p)
 
     def mean_square(self, covariance: Array, noise: Array) -> float:
         """Average |e|², m²; `covariance` and `noise` as in `KnownErrors`."""
@@ -168,38 +179,88 @@ class PointPrediction:
         return float(np.sqrt(self.point.by_chance(self.noise)))
 
 
-def _in_hand(at: Postures, known: KnownErrors, installed: Array, p: Array) -> PlacedPoint:
-    n = len(at.flange)
-    first, second = np.nonzero(~np.eye(n, dtype=bool)) if n > 1 else (np.zeros(1, int), np.zeros(1, int))
+def points_seen(mount: Mount, X: Array, distance_m: float, flange: Array) -> Array:
+    """Compute where, in base, the points are that the camera sees on its axis, metres.
+
+    X: (4, 4); flange: (n, 4, 4) base_from_flange. Returns (n, 3), one for each flange that carries the
+    camera, and (1, 3) for a fixed camera.
+    """
+    p = np.array([0.0, 0.0, distance_m])
+    in_parent = X[:3, :3] @ p + X[:3, 3]
+    if mount == "eye-in-hand":
+        return np.asarray(flange[:, :3, :3] @ in_parent + flange[:, :3, 3])
+    return np.asarray(in_parent[None])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Which posture a point is seen from, and from which it is placed: places (m,) among all postures."""
+
+    picture: NDArray[np.intp]
+    tool: NDArray[np.intp]
+
+    @classmethod
+    def of_recorded(cls, count: int) -> _Pairs:
+        """Pair all of at most `MOST_POSTURES` with each other; a single one with itself."""
+        some = _spread(np.arange(count))
+        if len(some) == 1:
+            return cls(some, some)
+        picture, tool = np.nonzero(~np.eye(len(some), dtype=bool))
+        return cls(some[picture], some[tool])
+
+    @classmethod
+    def within(cls, tool_m: float, seen: Array, flange: Array) -> _Pairs:
+        """Pair points (k, 3) with the flanges (n, 3) no farther than `tool_m`, or else with the nearest."""
+        pictures = []
+        tools = []
+        for picture in _spread(np.arange(len(seen))):
+            away = np.linalg.norm(flange - seen[picture], axis=1)
+            near = np.flatnonzero(away <= tool_m)
+            chosen = _spread(near) if len(near) else np.array([away.argmin()])
+            pictures.append(np.full(len(chosen), picture))
+            tools.append(chosen)
+        return cls(np.concatenate(pictures), np.concatenate(tools))
+
+
+def _spread(places: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Keep at most `MOST_POSTURES` of the places (n,), evenly spread."""
+    kept = np.linspace(0, len(places) - 1, min(len(places), MOST_POSTURES))
+    return np.asarray(places[np.unique(kept.astype(np.intp))])
+
+
+def _in_hand(
+    at: Postures, pairs: _Pairs, seen: Array, known: KnownErrors, installed: Array, p: Array
+) -> PlacedPoint:
     R = at.flange[:, :3, :3]
     t = at.flange[:, :3, 3]
-    seen = t + R @ (installed[:3, :3] @ p + installed[:3, 3])  # (n, 3) the point, by the installed X
     by_X = R @ _moves_point(known.X, p)
-    placed = _lever(seen[first] - t[second])
-    pictured = _lever(seen[first] - t[first])
-    by_arm = placed @ at.by_arm[second] - pictured @ at.by_arm[first]
-    by_bracket = -pictured @ at.by_bracket[first]
+    placed = _lever(seen[pairs.picture] - t[pairs.tool])
+    pictured = _lever(seen[pairs.picture] - t[pairs.picture])
+    by_arm = placed @ at.by_arm[pairs.tool] - pictured @ at.by_arm[pairs.picture]
+    by_bracket = -pictured @ at.by_bracket[pairs.picture]
     by_errors = np.concatenate([by_arm, by_bracket], axis=2)
     off = by_X @ difference(installed, known.X)
     return PlacedPoint(
-        mean=off[first] + by_errors @ known.errors,
-        by_unknown=np.concatenate([-by_X[first], by_errors], axis=2),
+        mean=off[pairs.picture] + by_errors @ known.errors,
+        by_unknown=np.concatenate([-by_X[pairs.picture], by_errors], axis=2),
         by_noise=np.concatenate([placed, -pictured], axis=2),
     )
 
 
-def _fixed(at: Postures, known: KnownErrors, installed: Array, p: Array) -> PlacedPoint:
-    n = len(at.flange)
-    t = at.flange[:, :3, 3]
-    seen = installed[:3, :3] @ p + installed[:3, 3]
-    by_X = np.broadcast_to(_moves_point(known.X, p), (n, 3, 6))
-    placed = _lever(seen - t)
-    by_errors = np.concatenate([placed @ at.by_arm, np.zeros((n, 3, at.by_bracket.shape[2]))], axis=2)
+def _fixed(
+    at: Postures, pairs: _Pairs, seen: Array, known: KnownErrors, installed: Array, p: Array
+) -> PlacedPoint:
+    count = len(pairs.tool)
+    by_X = np.broadcast_to(_moves_point(known.X, p), (count, 3, 6))
+    placed = _lever(seen[pairs.picture] - at.flange[pairs.tool, :3, 3])
+    by_arm = placed @ at.by_arm[pairs.tool]
+    # The bracket carries the board, which is not there when a point is placed.
+    by_errors = np.concatenate([by_arm, np.zeros((count, 3, at.by_bracket.shape[2]))], axis=2)
     off = by_X @ difference(installed, known.X)
     return PlacedPoint(
         mean=off + by_errors @ known.errors,
         by_unknown=np.concatenate([-by_X, by_errors], axis=2),
-        by_noise=np.concatenate([placed, np.zeros((n, 3, 6))], axis=2),
+        by_noise=np.concatenate([placed, np.zeros((count, 3, 6))], axis=2),
     )
 
 

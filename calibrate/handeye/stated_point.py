@@ -12,9 +12,9 @@ from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.estimate import Estimate
 from calibrate.handeye.information import MORE_VIEWS
-from calibrate.handeye.placed_point import KnownErrors, PlacedPoint, Postures
+from calibrate.handeye.placed_point import KnownErrors, PlacedPoint, Postures, points_seen
 from calibrate.handeye.uncertainty import inverse_of
-from calibrate.handeye.workspace import sample_range, sample_workspace
+from calibrate.handeye.workspace import sample_around
 from calibrate.results import PointError
 from recordings.geometry import Array
 
@@ -55,7 +55,9 @@ def state_point(
     square = at_recorded.mean_square(known.covariance, known.noise)
     workspace = square
     if basis.workspace is not None:
-        elsewhere = PlacedPoint.of(fit.views.mount, known, installed, distance_m, basis.workspace)
+        seen = points_seen(fit.views.mount, installed, distance_m, basis.flange)
+        tool_m = float(np.linalg.norm(seen - basis.flange[:, :3, 3], axis=1).max())
+        elsewhere = PlacedPoint.of(fit.views.mount, known, installed, distance_m, basis.workspace, tool_m)
         workspace = elsewhere.mean_square(known.covariance, known.noise)
 
     def with_views_times(factor: float) -> float:
@@ -142,9 +144,8 @@ def _basis(fit: CellFit) -> _Basis:
 
 
 def _elsewhere(arm: ArmPostures, mean_gravity: Array) -> Postures:
-    """Draw postures from the arm's workspace; of a learned chain from the range of its joints."""
-    table = arm.table
-    joints = sample_range(arm.joints_rad) if table is None else sample_workspace(table, arm.joints_rad)
+    """Draw postures where the arm may work next."""
+    joints = sample_around(arm.chain, arm.joints_rad)
     flange = arm.chain.forward(joints)
     return Postures(flange, arm.chain.by_links(joints), flex_motion(flange, mean_gravity))
 

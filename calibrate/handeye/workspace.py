@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibrate.arms.chain import Chain
 from calibrate.arms.kinematics import MODELS, RobotModel, forward, inverse_many
 from recordings.geometry import Array, matrix_from_quaternion, pose, skew
 from recordings.schema.messages import Mount
@@ -48,6 +49,35 @@ def sample_range(joints_rad: Array, count: int = 400, seed: int = 0) -> Array:
     """Draw joints (count, k) uniformly from the range of each joint in `joints_rad` (n, k). Deterministic."""
     low, high = joints_rad.min(axis=0), joints_rad.max(axis=0)
     return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+
+
+_MOST_ROUNDS = 20
+_WIDER_RAD = 0.5
+"""By which postures beyond the recorded ones are reached, at both ends of each joint's range."""
+
+
+def sample_around(chain: Chain, joints_rad: Array, count: int = 400) -> Array:
+    """Draw joints (count, k) where an arm that was recorded at `joints_rad` (n, k) may work next.
+
+    The first joint is anywhere, each other joint uniform in its recorded range and half a radian beyond it.
+    The flange stays above the base's plate, or above the lowest recorded flange. Deterministic.
+    """
+    rng = np.random.default_rng(0)
+    # Angles of inverse kinematics may jump by a whole turn
+    nearest = joints_rad[0] + np.angle(np.exp(1j * (joints_rad - joints_rad[0])))
+    low = nearest.min(axis=0) - _WIDER_RAD
+    high = nearest.max(axis=0) + _WIDER_RAD
+    low[0] = -np.pi
+    high[0] = np.pi
+    lowest = min(0.0, float(chain.forward(joints_rad)[:, 2, 3].min()))
+    found = np.zeros((0, joints_rad.shape[1]))
+    for _ in range(_MOST_ROUNDS):
+        drawn = rng.uniform(low, high, (2 * count, len(low)))
+        above = chain.forward(drawn)[:, 2, 3] >= lowest
+        found = np.concatenate([found, drawn[above]])
+        if len(found) >= count:
+            break
+    return found[:count] if len(found) else joints_rad
 
 
 def _branch(model: RobotModel, joints_rad: Array) -> int:

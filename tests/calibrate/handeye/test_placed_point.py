@@ -104,5 +104,36 @@ def test_an_error_of_base_moves_point_and_tool_alike() -> None:
     assert np.abs(point.mean).max() < 1e-4 * SMALL
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_no_point_is_placed_from_where_no_tool_reaches_it(mount: Mount) -> None:
+    """One posture stands two metres off. Only there the arm errs, and only a tool of that length shows it."""
+    rng = np.random.default_rng(11)
+    flange = poses(rng, 5)
+    flange[:, :3, 3] = 0.05 * rng.normal(size=(5, 3))
+    flange[-1, :3, 3] = [2.0, 0.0, 0.0]
+    errs = np.zeros((5, 6, 1))
+    errs[-1, 0] = 1.0
+    at = Postures(flange, errs, np.zeros((5, 6, 0)))
+    X = np.eye(4)
+    told = known(X, np.array([1e-3]), np.zeros((7, 7)), np.zeros(2))
+    far = PlacedPoint.of(mount, told, X, 0.5, at, tool_m=9.0).mean
+    near = PlacedPoint.of(mount, told, X, 0.5, at, tool_m=1.0).mean
+    assert np.abs(far).max() > 0.0
+    # Eye-in-hand the point that is seen from there is placed from there, and misses by the same on both ways.
+    assert np.abs(near).max() == 0.0
+
+
+def test_a_point_that_no_tool_reaches_is_placed_from_the_nearest_flange() -> None:
+    flange = poses(np.random.default_rng(12), 3)
+    flange[:, :3, 3] = [[3.0, 0.0, 0.5], [5.0, 0.0, 0.5], [7.0, 0.0, 0.5]]
+    motion = np.zeros((3, 6, 1))
+    motion[:, 0, 0] = [1.0, 2.0, 3.0]
+    at = Postures(flange, motion, np.zeros((3, 6, 0)))
+    X = np.eye(4)
+    told = known(X, np.array([1e-3]), np.zeros((7, 7)), np.zeros(2))
+    point = PlacedPoint.of("eye-to-hand", told, X, 0.5, at, 1.0)
+    assert np.linalg.norm(point.mean, axis=1) == pytest.approx([1e-3])
+
+
 def _cross(v: Array) -> Array:
     return np.array([[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in v])

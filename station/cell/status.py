@@ -326,11 +326,19 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     detection: DetectionStatus = DetectionStatus()
     recorder: RecorderStatus = RecorderStatus()
     session: SessionStatus = SessionStatus()
+    checked: SessionStatus = SessionStatus()
+    """The drift check just finished; `session` is then again what stood before it. Empty: none, or a session
+    or a plan came after it."""
     estimate: EstimateStatus = EstimateStatus()
     guidance: GuidanceStatus = GuidanceStatus()
     lease: LeaseStatus = LeaseStatus()
     events: tuple[Event, ...] = ()
     """Newest events, at most 100."""
+
+    @property
+    def finished(self) -> SessionStatus:
+        """The session that was finished last, if its `recording` is told; a drift check too."""
+        return self.checked if self.checked.recording else self.session
 
 
 def changed_sections(old: StationStatus, new: StationStatus) -> dict[str, object]:

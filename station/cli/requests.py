@@ -108,8 +108,8 @@ def finish_command(socket: Socket = None) -> None:
     """
     status = _after(Finish(), socket)
     _print_state(status)
-    if status.session.recording:
-        out.print(f"recording {status.session.recording}")
+    if status.finished.recording:
+        out.print(f"recording {status.finished.recording}")
 
 
 def retake_command(pose: PoseNumber, socket: Socket = None) -> None:

@@ -8,9 +8,9 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import msgspec
 import typer
@@ -88,16 +88,25 @@ class Attended:
         """One session, until it rests."""
         before, plans_here = await self.status(), self.plans_here if self.interactive else None
         started = await prepared_motion(self.client, Prepare(purpose), self.approves, plans_here=plans_here)
-        return await self.watch(started, before)
 
-    async def watch(self, started: object, before: StationStatus) -> StationStatus:
-        """A session that was just started, until it rests. RefusedError when it was not `started`."""
+        async def again() -> bool:
+            return await prepared_motion(self.client, Prepare(purpose), self.approves)
+
+        return await self.watch(started, before, again)
+
+    async def watch(
+        self, started: object, before: StationStatus, again: Callable[[], Awaitable[bool]]
+    ) -> StationStatus:
+        """A session that was just started, until it rests. RefusedError when it was not `started`.
+
+        `again`: asks once more to start what did not begin.
+        """
         if not started:
             raise RefusedError("not-approved")
         with session_progress(err, self._quiet, before) as show:
             status = await until_rest(self.client, show)
             while self._goes_on(status.cause):
-                await self._go_on(status)
+                await self._go_on(status, again)
                 status = await until_rest(self.client, show)
             if status.state is StationState.PAUSED and self._headless and status.session.captured:
                 await self.client.call(Finish())
@@ -114,17 +123,18 @@ class Attended:
         self.approved_again += unattended and late
         return unattended and late
 
-    async def _go_on(self, late: StationStatus) -> None:
+    async def _go_on(self, late: StationStatus, again: Callable[[], Awaitable[bool]]) -> None:
         """Acknowledge and approve the poses that are left, as a person at a real cell would."""
-        session = late.session
         if late.state is StationState.FAULT:
             await self.client.call(Acknowledge(late.cause))  # of no STOP by a person meanwhile
-        anew = Purpose.DRIFT_CHECK if session.check else Purpose.RUN
-        purpose = Purpose.RESUME if session.name else anew
+        begun = late.session.name and not late.session.recording
         while True:
             await wait_until_idle(self.client)
             try:
-                await prepared_motion(self.client, Prepare(purpose), self.approves)
+                if begun:
+                    await prepared_motion(self.client, Prepare(Purpose.RESUME), self.approves)
+                else:
+                    await again()
                 return
             except StationError as error:
                 if not self._goes_on(error.code):
@@ -210,7 +220,7 @@ def session_progress(console: Console, quiet: bool, before: StationStatus) -> It
 
         def show(status: StationStatus) -> None:
             nonlocal told
-            session, events = status.session, status.events
+            session, events = status.finished, status.events
             where = f"pose {session.current + 1} " if session.current is not None else ""
             bar(session.captured, len(session.poses), f"{where}{status.state.value}")
             new = events[events.index(told[0]) + 1 :] if told and told[0] in events else events
@@ -283,13 +293,17 @@ def drift_check_command(
                 identity = standing.robot.identity
                 raise RefusedError("moved-by-hand", robot=identity.model if identity else "The arm")
             kept = None if plan is None else load_plan(plan)
-            started = await start_drift_check(shell.client, standing, shell.approves, poses, kept)
-            return await shell.watch(started, standing)
+
+            async def start() -> bool:
+                return await start_drift_check(shell.client, standing, shell.approves, poses, kept)
+
+            return await shell.watch(await start(), standing, start)
 
     outcome = asyncio.run(captured())
-    if not outcome.session.recording:
-        _finish(outcome, False)
-    what = check_arguments(outcome.session.recording, outcome.session.folder)
+    check = outcome.checked
+    if not check.recording:
+        _not_finished(outcome)
+    what = check_arguments(check.recording, check.folder)
     done = subprocess.run([sys.executable, "-m", "calibrate.cli", *what])
     raise typer.Exit(done.returncode)
 
@@ -323,7 +337,7 @@ class SessionJson(msgspec.Struct, frozen=True):
 
 
 def _finish(outcome: StationStatus, as_json: bool) -> None:
-    session = outcome.session
+    session = outcome.finished
     if as_json:
         poses = PosesJson(len(session.poses), session.captured)
         print_json(SessionJson(outcome.state, poses, session.recording))
@@ -336,5 +350,10 @@ def _finish(outcome: StationStatus, as_json: bool) -> None:
         next_step = of_session(session.recording, session.folder)
         out.print(f"Next: calibrate {shlex.join(next_step)}")
     else:
-        err.print(Text.assemble((outcome.state.value, "bold"), f": {outcome.reason}"))
+        _not_finished(outcome)
     raise typer.Exit(1 if not session.recording else 3 if session.captured < len(session.poses) else 0)
+
+
+def _not_finished(outcome: StationStatus) -> NoReturn:
+    err.print(Text.assemble((outcome.state.value, "bold"), f": {outcome.reason}"))
+    raise typer.Exit(1)

@@ -56,17 +56,19 @@ def _never_run(status: StationStatus) -> int:
 async def recorded(link: Client, before: str) -> SessionStatus | None:
     """Wait until the drift check's recording is finished, also after pauses; return the session.
 
-    `before`: name of the session before it. None when another begins, or when the daemon ends.
+    `before`: name of the check before it. None when another session begins, or when the daemon ends.
     """
     seen = False
     async for status in link.statuses():
-        session = status.session
-        ours = session.check and session.name not in ("", before)
+        session, checked = status.session, status.checked
+        if checked.name not in ("", before):
+            if status.state is StationState.IDLE:
+                return checked
+            continue
+        ours = session.check and bool(session.name)
         if seen and not ours:
             return None
         seen = seen or ours
-        if ours and session.recording and status.state is StationState.IDLE:
-            return session
     return None
 
 

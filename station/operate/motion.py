@@ -105,6 +105,6 @@ async def until_rest(link: Client, watch: Watcher) -> StationStatus:
         watch(status)
         if status.state in _RESTING:
             return status
-        if status.state is StationState.IDLE and (status.session.recording or status.reason):
+        if status.state is StationState.IDLE and (status.finished.recording or status.reason):
             return status
     raise DaemonGoneError("daemon-ended", during="during the session")

@@ -49,6 +49,15 @@ class RunRequests:
     """STOP, a fault or lost control ended the run, which must not change the state any more."""
 
 
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """What is loaded and shown: a plan's poses, and the session they are of."""
+
+    queue: PoseQueue | None = None
+    """None: no plan."""
+    session: SessionStatus = field(default_factory=SessionStatus)
+
+
 @dataclass(eq=False)
 class SessionContext:
     """Shared state of a session. For the event loop's thread only, unless stated otherwise."""
@@ -63,6 +72,10 @@ class SessionContext:
     """Recording of the open session; None: no session is open."""
     seen: dict[int, BoardView] = field(default_factory=dict)
     """Pose number → view that counts."""
+    replaced: Loaded | None = None
+    """What the loaded plan replaced, until a session begins with it."""
+    before_check: Loaded = field(default_factory=Loaded)
+    """What stood before a drift check, and stands again after it."""
     requests: RunRequests = field(default_factory=RunRequests)
 
     @property
@@ -171,10 +184,44 @@ class SessionContext:
         if self.recording is not None:
             self.recording.require_same_cell(connected=connected)
 
-    def forget_session(self, check: bool = False) -> None:
-        """Clear the last session from the status when a session begins; `check`: as a drift check."""
+    @property
+    def standing(self) -> Loaded:
+        """What is loaded and shown now."""
+        return Loaded(self.queue, self.store.status.session)
+
+    def stand_again(self, before: Loaded) -> None:
+        """Load and show what stood before."""
+        self.queue = before.queue
+        self.store.update(session=before.session)
+
+    def forget_session(self) -> None:
+        """Clear the last session from the status."""
         self.seen.clear()
-        self.store.update(session=SessionStatus(check=check))
+        self.store.update(session=SessionStatus(), checked=SessionStatus())
+
+    def begin_session(self, before_check: Loaded | None = None) -> None:
+        """Show a new session in place of the last one.
+
+        `before_check`: what stands again after a drift check; None: it is none.
+        """
+        self.before_check = before_check or Loaded()
+        self.replaced = None
+        self.forget_session()
+        self.store.update_session(check=before_check is not None)
+
+    def end_check(self) -> None:
+        """After a drift check show again what stood before it; `checked` tells what was recorded.
+
+        Does nothing in another session, or while its recording is open.
+        """
+        check = self.store.status.session
+        if not check.check or self.recording is not None:
+            return
+        before, self.before_check = self.before_check, Loaded()
+        self.seen.clear()
+        self.stand_again(before)
+        if check.recording:
+            self.store.update(checked=check)
 
     def show_poses(self, current: int | None = None) -> None:
         """Update the status from queue and recording. `current`: number of the pose under way."""

@@ -49,6 +49,7 @@ async def _seal(context: SessionContext) -> None:
     poses = len(queue.statuses)
     text = f"finished with {queue.done} of {poses} poses: {path}"
     context.store.event("finished", text, captured=queue.done, poses=poses, path=str(path))
+    context.end_check()
     if context.store.state in (StationState.SEALING, StationState.PAUSED):
         context.store.enter(StationState.IDLE)
 

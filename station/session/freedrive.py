@@ -116,7 +116,7 @@ class FreedriveCapture:
         queue = context.queue.anew(guided=False) if new else context.queue
         await context.open_recording(queue, check=check)
         if new:
-            context.forget_session(check=check)
+            context.begin_session(context.standing if check else None)
         context.queue = queue
         context.show_poses()
 

@@ -58,6 +58,7 @@ class Run:
                 await self._mover.end_control()
             finally:  # no pose is under way any more
                 self._context.show_poses()
+                self._context.end_check()
 
     async def _begin(self) -> bool:
         """Start control and open the recording. False when refused: the state is as before the approval."""

@@ -20,7 +20,7 @@ from station.cell.errors import RefusedError, RobotError, StationError
 from station.cell.layout import approval_sha256
 from station.cell.pose_plan import Plan
 from station.cell.session_folder import interrupted_session
-from station.cell.status import LeaseStatus, MotionPreview, SessionStatus, StationState, StationStatus
+from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import wait_for_state
 from station.devices.cell import Cell
@@ -75,8 +75,6 @@ class Session:
         self._run: asyncio.Task[None] | None = None
         self._stops = 0
         """Number of STOPs: an acknowledgement is not of one that came after it was asked for."""
-        self._replaced: tuple[PoseQueue | None, SessionStatus] | None = None
-        """What the loaded plan replaced."""
         self._ending = False
         """The daemon ends: nobody gets or keeps control."""
         self._tasks: list[asyncio.Task[None]] = []
@@ -286,7 +284,9 @@ class Session:
         run, motion = Run(context, go), go.motion
         if motion.stop_test is None:
             if context.recording is None:
-                context.forget_session(check=motion.purpose is Purpose.DRIFT_CHECK)
+                check = motion.purpose is Purpose.DRIFT_CHECK
+                # Its plan was loaded for it alone; else the plan itself stands there again.
+                context.begin_session((context.replaced or context.standing) if check else None)
             context.queue = motion.queue
             context.show_poses()
         if by_person:
@@ -355,10 +355,10 @@ class Session:
         self._require_no_session()
         if plan is not None:
             self._replace_plan(plan)
-        elif self._replaced is not None:
+        elif (before := self.context.replaced) is not None:
             self.approvals.void()
-            (self.context.queue, session), self._replaced = self._replaced, None
-            self.store.update(session=session)
+            self.context.replaced = None
+            self.context.stand_again(before)
 
     async def make_plan(self, client_id: int, wanted: verbs.MakePlan) -> None:
         """Make a plan in the worker and load it. ConfigError and LimitError say what prevents it."""
@@ -387,7 +387,7 @@ class Session:
 
     def _replace_plan(self, plan: Plan) -> None:
         self.approvals.void()
-        self._replaced = self.context.queue, self.store.status.session
+        self.context.replaced = self.context.standing
         self.context.queue = PoseQueue(plan)
         self.context.forget_session()
         self.context.show_poses()

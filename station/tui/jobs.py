@@ -53,7 +53,7 @@ async def check_drift(link: DaemonLink, approves: Approve) -> None:
     if not await link.start(start_drift_check(link.client, status, approves)):
         return
     await link.app.switch_mode("capture")
-    session = await recorded(link.client, status.session.name)
+    session = await recorded(link.client, status.checked.name)
     if session is None:
         link.app.notify(NO_VERDICT, timeout=10)
         return

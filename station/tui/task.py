@@ -7,7 +7,14 @@ from dataclasses import dataclass
 
 from calibrate.files.validity import validity_text
 from station.cell.config import StationConfig
-from station.cell.status import NO_IMAGE, DetectionStatus, GuidanceStatus, StationState, StationStatus
+from station.cell.status import (
+    NO_IMAGE,
+    DetectionStatus,
+    GuidanceStatus,
+    SessionStatus,
+    StationState,
+    StationStatus,
+)
 from station.operate.goal import above_goal
 from station.operate.next_step import StepKind, after_solve
 from station.protocol.states import LATCHED, RUNNING
@@ -289,20 +296,27 @@ def to_wanted(guidance: GuidanceStatus, seen: DetectionStatus) -> Action:
 
 def _at_rest(known: Known, status: StationStatus) -> Action:
     session, result, missing = status.session, known.result, known.missing
-    if missing is not None and not session.recording:  # solving and installing need no device
+    recorded = session.recording or status.checked.recording
+    if missing is not None and not recorded:  # solving and installing need no device
         why = sentence(missing.remedy or missing.text)
         return Action("", f"Mend: {missing.name}", why, at="connect", look=True)
+    if _to_judge(known, status.checked):
+        return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
     if session.poses and not session.recording:
         asks = f"Shows the motion to {many(len(session.poses), 'pose')} and asks first."
         return Action("F5", "Start the capture", f"{sentence(status.reason)} {asks}".strip())
-    judged = result is not None and session.name in {check.recording for check in result.state.drift}
-    if session.check and session.recording and not judged:
-        return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
     if result is not None:
         return _with_result(result, status)
     if not session.poses:
         return Action("F5", "Plan and start", "Plans, shows the motion and asks first.")
     return Action("F9", "Solve", f"{many(session.captured, 'pose')} saved; solving takes some seconds.")
+
+
+def _to_judge(known: Known, checked: SessionStatus) -> bool:
+    """A drift check was recorded, and nobody has asked yet what it says."""
+    if not checked.recording or not checked.captured:
+        return False
+    return not any(kept.session.name == checked.name and kept.check for kept in known.sessions or ())
 
 
 def _with_result(result: Result, status: StationStatus) -> Action:

@@ -383,7 +383,7 @@ def crash(rig: Rig) -> None:
 
 def sealed(rig: Rig) -> Recording:
     """Open what the session wrote."""
-    return open_recording(Path(rig.session.store.status.session.recording))
+    return open_recording(Path(rig.session.store.status.finished.recording))
 
 
 NewRig = Callable[..., Awaitable[Rig]]

@@ -159,6 +159,12 @@ def in_session(status: StationStatus, **changes: object) -> StationStatus:
     return msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, **changes))
 
 
+def after_check(status: StationStatus, **changes: object) -> StationStatus:
+    """The status after a drift check that was recorded as s-2."""
+    check = SessionStatus(name="s-2", folder="/s-2", recording="/s-2/session.mcap", captured=8, check=True)
+    return msgspec.structs.replace(status, checked=msgspec.structs.replace(check, **changes))
+
+
 def with_robot(status: StationStatus, **changes: object) -> StationStatus:
     """The status with fields of its robot replaced."""
     return msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, **changes))

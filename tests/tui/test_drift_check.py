@@ -17,7 +17,7 @@ from station.tui import jobs
 from station.tui.dialogs import ConfirmMotion, JobScreen
 from station.tui.installed import Installed, Result, read_installed
 from station.tui.result import check_rows
-from tests.tui.conftest import FakeLink, idle, in_session, opened, said, text_of, until
+from tests.tui.conftest import FakeLink, after_check, idle, in_session, opened, said, text_of, until
 from tests.tui.test_install import GOOD
 
 JOB = """
@@ -41,9 +41,12 @@ def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return tmp_path
 
 
-def check_session(root: Path, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
-    folder = str(root / "root/sessions/s-2")
-    return in_session(idle(state), name="s-2", check=True, folder=folder, recording=recording)
+def check_session(state: StationState) -> StationStatus:
+    return in_session(idle(state), name="s-2", check=True)
+
+
+def finished(recording: str, state: StationState = StationState.IDLE) -> StationStatus:
+    return after_check(idle(state), folder=str(Path(recording).parent), recording=recording)
 
 
 async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp_path: Path) -> None:
@@ -64,13 +67,13 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
         assert verbs.Prepare(verbs.Purpose.DRIFT_CHECK) in link.asked
         await pilot.press("tab", "enter")
         await until(pilot, lambda: "go" in link.verbs and app.current_mode == "capture")
-        link.show(check_session(installed, state=StationState.PAUSED))
+        link.show(check_session(StationState.PAUSED))
         await until(pilot, lambda: "PAUSED" in text_of(app, "#bar"))
-        link.show(check_session(installed, recording, StationState.SEALING))
+        link.show(finished(recording, StationState.SEALING))
         await until(pilot, lambda: "SEALING" in text_of(app, "#bar"))
         await pilot.pause(0.3)
         assert not (installed / "asked").exists()
-        link.show(check_session(installed, recording))
+        link.show(finished(recording))
         await until(pilot, lambda: isinstance(app.screen, JobScreen) and app.screen.said)
         asked = json.loads((installed / "asked").read_text())
         assert asked == ["drift-check", recording, "--root", str(installed / "root")]

@@ -19,7 +19,7 @@ from station.tui import app as app_module
 from station.tui.installed import read_installed
 from station.tui.sessions import _row
 from station.tui.task import next_action
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, text_of, until
+from tests.tui.conftest import FakeLink, after_check, app_on, idle, in_session, opened, text_of, until
 from tests.tui.test_install import GOOD, OFF
 
 
@@ -125,7 +125,7 @@ async def test_after_a_drift_check_the_result_is_what_it_judged(link: FakeLink, 
     app, folder = app_on(link), root / "sessions" / "s-2"
     (folder / "calibration.yaml").unlink()
     write_state(folder, SessionState("simulated", Plan("UR10", "eye-in-hand", ()), (), check=True))
-    link.show(in_session(idle(), name="s-2", check=True, folder=str(folder), recording="session.mcap"))
+    link.show(after_check(in_session(idle(), name="", poses=())))
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.known.result and app.known.sessions)
         assert next_action(app.known).key == "k"

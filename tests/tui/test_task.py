@@ -26,7 +26,18 @@ from station.tui.dialogs import Confirm, ConfirmMotion, Reason
 from station.tui.frame import Question, StopBlock, bar_line, next_line, rail_line
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from tests.recordings.small_recording import make_state
-from tests.tui.conftest import SUMMARY, FakeLink, idle, in_session, opened, said, text_of, until, with_robot
+from tests.tui.conftest import (
+    SUMMARY,
+    FakeLink,
+    after_check,
+    idle,
+    in_session,
+    opened,
+    said,
+    text_of,
+    until,
+    with_robot,
+)
 
 SIZES = [(80, 24), (160, 48)]
 HELD = ArmCondition(held="protective stop: find what the arm ran into, then enable it on the pendant")
@@ -59,7 +70,9 @@ CASES = [
     (Known(in_session(idle(), poses=())), "F5"),
     (Known(in_session(idle(), name="")), "F5"),
     (Known(in_session(idle(), recording="/r")), "F9"),
-    (Known(in_session(idle(), recording="/r", check=True)), DIGITS["sessions"]),
+    (Known(after_check(idle())), DIGITS["sessions"]),
+    (Known(after_check(in_session(idle(), recording="/r"))), DIGITS["sessions"]),
+    (Known(after_check(idle(), captured=0)), "F5"),
 ]
 
 
@@ -69,7 +82,7 @@ def test_every_state_has_one_next_action(known: Known, key: str) -> None:
 
 
 def test_a_key_of_another_screen_becomes_the_way_there() -> None:
-    action = next_action(Known(in_session(idle(), recording="/r", check=True)))
+    action = next_action(Known(after_check(idle())))
     assert (action.on("sessions").key, action.on("capture").key) == ("k", DIGITS["sessions"])
     lost = next_action(Known(idle(StationState.DISCONNECTED)))
     assert (lost.on("connect").key, lost.on("capture").key) == ("", DIGITS["connect"])

@@ -65,21 +65,25 @@ async def test_a_plan_whose_hash_was_approved_before_is_captured_as_it_is(link: 
     assert verbs.LoadPlan(plan) in link.asked and "make_plan" not in link.verbs
 
 
-def during(name: str, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
-    check = name == "check"
-    return StationStatus(state=state, session=SessionStatus(name=name, check=check, recording=recording))
+def during(name: str, state: StationState = StationState.MOVING) -> StationStatus:
+    return StationStatus(state=state, session=SessionStatus(name=name, check=name == "check"))
+
+
+def after(name: str, state: StationState = StationState.IDLE) -> StationStatus:
+    """A finished check; the session of before is shown again."""
+    check = SessionStatus(name=name, recording="r.mcap", check=True)
+    return msgspec.structs.replace(during("old", state), checked=check)
 
 
 async def test_its_finished_recording_ends_it_after_pauses_too() -> None:
-    told = [during("old"), during("check"), during("check", state=StationState.PAUSED)]
-    last = during("check", "r.mcap")
-    sealing = during("check", "r.mcap", StationState.SEALING)
-    assert await recorded(Telling(*told, sealing, last), "old") == last.session
+    told = [after("the check before"), during("check"), during("check", StationState.PAUSED)]
+    last, sealing = after("check"), after("check", StationState.SEALING)
+    assert await recorded(Telling(*told, sealing, last), "the check before") == last.checked
 
 
 async def test_another_session_ends_it_without_a_recording() -> None:
-    assert await recorded(Telling(during("check"), during("new", "r.mcap")), "") is None
-    assert await recorded(Telling(during("check", "r.mcap"), during("new"), ends=True), "check") is None
+    assert await recorded(Telling(during("check"), during("new")), "") is None
+    assert await recorded(Telling(after("before"), during("new"), ends=True), "before") is None
 
 
 async def test_an_arm_that_a_person_moves_is_guided(link: FakeLink) -> None:

@@ -66,7 +66,8 @@ async def test_views_by_hand_carry_the_told_pose_and_joints(rig: Rig, told: tupl
         await rig.session.switch_free_drive(1, True, check=True)
     await rig.session.finish(1)
     recording = sealed(rig)
-    assert rig.session.store.status.session.check is bool(told)
+    assert rig.session.store.status.finished.check is bool(told)
+    assert not rig.session.store.status.session.check
     assert [view.joints_rad for view in recording.views()] == [told or None] * 2
     assert {state.joints_rad for state in recording.robot_states()} == {told}
     assert recording.robot_samples().joints_rad.shape[1] == len(told)

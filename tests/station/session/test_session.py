@@ -300,3 +300,31 @@ async def test_what_a_plan_replaced_stands_again_as_it_was(rig: Rig) -> None:
     assert rig.session.context.loaded().plan == plan and rig.session.context.loaded().done == POSES
     with raises("approval-used"):
         await rig.session.go(1, offer.token)
+
+
+async def test_a_finished_drift_check_gives_back_the_plan_that_stood_before(rig: Rig) -> None:
+    await rig.go_until(S.IDLE)
+    before, plan = rig.session.store.status.session, rig.session.context.loaded().plan
+    rig.session.load_plan(1, msgspec.structs.replace(plan, poses=plan.poses[:2]))
+    await rig.go_until(S.IDLE, purpose=Purpose.DRIFT_CHECK)
+    status = rig.session.store.status
+    assert status.checked.check and status.checked.captured == len(status.checked.poses) == 2
+    assert len(open_recording(Path(status.checked.recording)).views()) == 2
+    assert status.finished == status.checked
+    assert status.session == before, "with its recording, for F9"
+    offer = await rig.session.prepare(1, Purpose.RUN)
+    assert offer.poses == POSES
+    await rig.session.go(1, offer.token)
+    await rig.until(S.IDLE)
+    status = rig.session.store.status
+    assert status.finished == status.session and status.session.captured == POSES
+    assert not status.session.check and not status.checked.name
+
+
+async def test_so_does_a_drift_check_that_did_not_begin(rig: Rig, small_plan: Plan) -> None:
+    rig.session.load_plan(1, msgspec.structs.replace(small_plan, poses=small_plan.poses[:2]))
+    rig.arm.refuse_control = RobotError("stopped")
+    await rig.give_go(Purpose.DRIFT_CHECK)
+    await rig.until(S.IDLE)
+    await until(lambda: len(rig.session.store.status.session.poses) == POSES)
+    assert not rig.session.store.status.session.check and not rig.session.store.status.checked.name

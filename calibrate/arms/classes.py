@@ -31,7 +31,7 @@ class ArmClass:
     title: str
     """The class in a person's words, as in "of an arm of Universal Robots"."""
     shift_m: float
-    """1σ per axis of the error of the flange's position over the workspace, metres."""
+    """1σ per axis of the error of the flange's position over the workspace, its base registered, metres."""
     turn_rad: float
     """1σ per axis of the error of its orientation, radians."""
     repeatability_m: float

@@ -18,7 +18,7 @@ from calibrate.arms.kinematics import MODELS, RobotModel
 from calibrate.handeye.arm import ArmPostures, joints_of_one_branch, recorded_joints
 from calibrate.handeye.workspace import sample_workspace
 from calibrate.views.view_set import ViewSet
-from recordings.geometry import Array
+from recordings.geometry import Array, skew
 
 _TYPICAL = replace(MODELS["UR10"], d_m=(0.1273, 0.0, 0.0, 0.0, 0.1157, 0.0922))
 """A UR10 whose links are in one plane with its first axis, so that it reaches past that axis, too."""
@@ -79,20 +79,31 @@ def link_sizes(arm: ArmPostures, of_class: ArmClass) -> LinkSizes:
     """Find the errors of links with which the flange is as far off, over the workspace, as in this class.
 
     The flange moves by Σ B_k ε_k (`Chain.by_links`): of links with independent errors its variance is the sum
-    of those of shifts and turns, each in proportion to the square of its size.
+    of those of shifts and turns, each in proportion to the square of its size. Who measures an arm's accuracy
+    of position registers its base first: what moves all postures as one body is not in the class's figure,
+    though it is in the links, and in the pose of a fixed camera.
     """
     joints = arm.joints_rad if arm.table is None else sample_workspace(arm.table, arm.joints_rad)
     motion = arm.chain.by_links(joints)
+    turned = motion[:, 3:]
+    shifted = _beside_registration(arm.chain.forward(joints)[:, :3, 3], motion[:, :3])
     kind = np.arange(motion.shape[2]) % 6
-    by_shifts = motion[..., kind < 3]
-    by_turns = motion[..., kind >= 3]
-    position_by_shifts = _mean_square(by_shifts[:, :3])
-    position_by_turns = _mean_square(by_turns[:, :3])
-    turn = of_class.turn_rad / np.sqrt(_mean_square(by_turns[:, 3:]))
-    left = of_class.shift_m**2 - turn**2 * position_by_turns
+    by_shift = kind < 3
+    by_turn = kind >= 3
+    turn = of_class.turn_rad / np.sqrt(_mean_square(turned[..., by_turn]))
+    left = of_class.shift_m**2 - turn**2 * _mean_square(shifted[..., by_turn])
     least = (_LEAST_SHIFT_SHARE * of_class.shift_m) ** 2
-    shift = np.sqrt(max(left, least) / position_by_shifts)
+    shift = np.sqrt(max(left, least) / _mean_square(shifted[..., by_shift]))
     return LinkSizes(float(_MM * shift), float(_MM * turn))
+
+
+def _beside_registration(place: Array, shifted: Array) -> Array:
+    """Take off the shifts (n, 3, q) what the best rigid motion of base makes of them, at places (n, 3)."""
+    eye = np.broadcast_to(np.eye(3), (len(place), 3, 3))
+    by_base = np.concatenate([eye, -skew(place)], axis=2).reshape(-1, 6)
+    rows = shifted.reshape(len(by_base), -1)
+    left = rows - by_base @ np.linalg.lstsq(by_base, rows, rcond=None)[0]
+    return np.asarray(left.reshape(shifted.shape))
 
 
 def _mean_square(motion: Array) -> float:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calibrate.arms.classes import ARM_CLASSES, ArmClass
 from calibrate.handeye.arm import ArmPostures
@@ -54,16 +55,28 @@ def test_its_links_err_by_so_much_that_the_flange_is_as_far_off_as_in_its_class(
 
 
 def _drawn_errors(arm: ArmPostures, shift_mm: float, turn_mrad: float) -> Array:
-    """[δt, δφ] of the flange all over the workspace, over many draws of the links' errors."""
+    """[δt, δφ] of the flange all over the workspace, over many draws of the links' errors.
+
+    For the shifts base is registered in each draw, as those do who measure an arm's accuracy: by the rigid
+    motion that brings the measured places nearest to the told ones.
+    """
     from calibrate.handeye.workspace import sample_workspace
 
     assert arm.table is not None
     rng = np.random.default_rng(0)
-    motion = arm.chain.by_links(sample_workspace(arm.table, arm.joints_rad, 100))
+    joints = sample_workspace(arm.table, arm.joints_rad, 100)
+    motion = arm.chain.by_links(joints)
+    place = arm.chain.forward(joints)[:, :3, 3]
+    about_m = place - place.mean(axis=0)
     sigma = 1e-3 * np.tile(np.repeat([shift_mm, turn_mrad], 3), motion.shape[2] // 6)
-    return np.asarray(
-        (motion @ (sigma[:, None] * rng.normal(size=(len(sigma), 400)))).swapaxes(1, 2)
-    ).reshape(-1, 6)
+    registered = []
+    for _ in range(300):
+        off = motion @ (sigma * rng.normal(size=len(sigma)))
+        shift_m = off[:, :3] - off[:, :3].mean(axis=0)
+        turned = Rotation.align_vectors(about_m + shift_m, about_m)[0]
+        left_m = about_m + shift_m - turned.apply(about_m)
+        registered.append(np.concatenate([left_m, off[:, 3:]], axis=1))
+    return np.concatenate(registered)
 
 
 def test_what_was_told_of_this_very_arm_stands_before_its_class() -> None:

@@ -14,6 +14,7 @@ from multiprocessing import get_context, parent_process
 from typing import TypeVar
 
 from station.cell.errors import StationError
+from station.cell.plain import plain_struct
 from station.cell.process import die_with_parent
 
 log = logging.getLogger(__name__)
@@ -47,6 +48,7 @@ class Workers:
     ) -> R:
         """Return the function's result or raise its exception; WorkerError when the process fails or is late.
 
+        A result that is a message's struct holds plain values only: `plain_struct` has converted them.
         `timeout_s` counts from the start of the call in a ready worker, not from its queueing.
         """
         self.waiting += 1
@@ -70,7 +72,7 @@ class Workers:
             raise died
         try:
             async with asyncio.timeout(timeout_s):
-                return await asyncio.wrap_future(pool.submit(work))
+                return await asyncio.wrap_future(pool.submit(partial(_plainly, work)))
         except asyncio.CancelledError as cancelled:
             self._discard(pool)  # its work would go on, and count as time of the next call
             if _is_being_cancelled():
@@ -99,6 +101,11 @@ class Workers:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.kill()
+
+
+def _plainly(work: partial[R]) -> R:
+    """Run a call in the worker process; what reaches a message is converted before it leaves here."""
+    return plain_struct(work())
 
 
 def _is_being_cancelled() -> bool:

@@ -341,10 +341,18 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
         return self.checked if self.checked.recording else self.session
 
 
+def differ(old: object, new: object) -> bool:
+    """Tell whether two sections differ; those that cannot be compared, as of an array, do."""
+    try:
+        return bool(old != new)
+    except ValueError:
+        return old is not new
+
+
 def changed_sections(old: StationStatus, new: StationStatus) -> dict[str, object]:
     """Return the top-level fields that differ, as sent to watchers after the first full status."""
     return {
         name: getattr(new, name)
         for name in StationStatus.__struct_fields__
-        if getattr(old, name) != getattr(new, name)
+        if differ(getattr(old, name), getattr(new, name))
     }

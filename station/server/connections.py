@@ -12,7 +12,7 @@ import logging
 import socket
 import termios
 from collections import defaultdict, deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,7 @@ from station.protocol.messages import (
     Answer,
     Request,
     answer_line,
+    news_line,
 )
 from station.protocol.states import RUNNING
 from station.protocol.verbs import VERBS, Stop
@@ -57,6 +58,8 @@ class ClientServer:
         self._path, self._handler = path, handler
         self._status = StationStatus()
         """As it was sent last."""
+        self._left_out = set[str]()
+        """Sections that could not be sent."""
         self._listening: socket.socket | None = None
         self._connections: set[_Connection] = set()
         self._serving: dict[asyncio.Task[None], int] = {}
@@ -84,7 +87,7 @@ class ClientServer:
         changes = changed_sections(self._status, status)
         self._status = status
         if changes:
-            line = answer_line(Answer(changes=changes))
+            line = self._news_line(changes, whole=False)
             in_control = status.lease.client_id if status.state in RUNNING else None
             for connection in list(self._connections):
                 if connection.watching:
@@ -93,6 +96,16 @@ class ClientServer:
                     if unread_s > UNREAD_LIMIT_S:
                         connection.abort()
         return status
+
+    def _news_line(self, sections: Mapping[str, object], whole: bool) -> bytes:
+        """Encode news of the status; tell once of each section that no client could read."""
+        line, left_out = news_line(sections, whole)
+        for name, reason in left_out.items():
+            if name not in self._left_out:
+                log.error("section %s of the status is left out: %s", name, reason)
+                self._handler.left_out(name)
+        self._left_out = (self._left_out - sections.keys()) | left_out.keys()
+        return line
 
     async def close(self) -> None:
         if self._listening is not None:
@@ -149,7 +162,7 @@ class ClientServer:
 
     async def _serve(self, link: socket.socket, peer: Peer) -> None:
         reader, writer = await asyncio.open_unix_connection(sock=link, limit=LINE_LIMIT_BYTES)
-        connection = _Connection(peer, reader, writer, self._handler, self.publish)
+        connection = _Connection(peer, reader, writer, self._handler, self.publish, self._news_line)
         self._connections.add(connection)
         if self._listening is None:  # closed since it was let in
             connection.drop("the daemon ends")
@@ -170,12 +183,13 @@ class _Connection:
         writer: asyncio.StreamWriter,
         handler: SessionDispatcher,
         publish: Callable[[], StationStatus],
+        news_line: Callable[[Mapping[str, object], bool], bytes],
     ) -> None:
-        """`publish`: that of the server."""
+        """`publish`, `news_line`: those of the server."""
         self.peer = peer
         self.watching = False
         self._reader, self._writer, self._handler = reader, writer, handler
-        self._publish = publish
+        self._publish, self._news_line = publish, news_line
         self._tasks: set[asyncio.Task[None]] = set()
         self._works, self._read_s = False, 0.0
         """The arm works by this client; when it had last read everything since then."""
@@ -226,7 +240,7 @@ class _Connection:
             status = self._publish()  # before the reply, so that the client never sees an older status
             self.reply(Answer(request.id, True, result))
             if request.verb == "watch" and not self.watching:
-                self.reply(Answer(status=status))
+                self.send(self._news_line(msgspec.structs.asdict(status), True))
                 self.watching = True
         except CodedError as error:
             self.refuse(request.id, error)

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 
 import msgspec
 
-from station.cell.errors import RefusedError, RobotError
+from station.cell.errors import RefusedError, RobotError, StationError
 from station.cell.socket_folder import user_name
 from station.cell.status import StationState, StationStatus
 from station.cell.stillness import RESTING_RAD_S, fastest_rad_s
@@ -58,6 +58,11 @@ class SessionDispatcher:
         if self.latched and cell.mover is not None and not cell.mover.after_stop(state):
             return ArmMotion.MOVES
         return ArmMotion.RESTS
+
+    def left_out(self, section: str) -> None:
+        """Tell that a section of the status reaches no client, where a defect made it unreadable."""
+        defect = StationError("status-unreadable", section=section)
+        self._session.store.problem(defect, "error")
 
     def stop_by_client(self, peer: Peer) -> Awaitable[object]:
         """Begin STOP at once; return an awaitable for its end."""

@@ -14,13 +14,14 @@ import msgspec
 
 from calibrate.views.view_set import BoardView
 from recordings.errors import CodedError, RecordingError, Value, plain_value
+from recordings.plain_text import plain_text
 from recordings.recorder import Recorder
 from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, RobotState, Stamps
 from station.analysis.pool import Workers
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionState
-from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
+from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus, differ
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import wait_for_state
 from station.devices.cell import Cell
@@ -261,7 +262,19 @@ def _require_same_plan(cell: Cell, folder: Path, state: SessionState, advice: st
 
 
 def _cut(text: str, limit: int = REASON_LIMIT) -> str:
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+    """Shorten a text, and put signs for what neither a terminal nor a recording takes."""
+    return plain_text(text if len(text) <= limit else text[: limit - 1] + "…")
+
+
+def _cut_value(value: Value) -> Value:
+    """Shorten the value of an event, of which a hundred are kept and sent."""
+    if isinstance(value, str):
+        return _cut(value, EVENT_TEXT_LIMIT)
+    if isinstance(value, list):
+        return [
+            _cut(each, EVENT_TEXT_LIMIT) if isinstance(each, str) else each for each in value[:EVENTS_KEPT]
+        ]
+    return value
 
 
 class StatusStore:
@@ -284,7 +297,7 @@ class StatusStore:
         self._watchers.append(changed)
 
     def update(self, **sections: object) -> None:
-        changed = {k: v for k, v in sections.items() if getattr(self.status, k) != v}
+        changed = {k: v for k, v in sections.items() if differ(getattr(self.status, k), v)}
         if changed:
             self.status = msgspec.structs.replace(self.status, **changed)
             for watcher in self._watchers:
@@ -311,7 +324,7 @@ class StatusStore:
     ) -> None:
         """Publish an event to status, log and recording; `code` and `values` are for programs."""
         text = _cut(text, EVENT_TEXT_LIMIT)
-        plain = {name: plain_value(value) for name, value in values.items()}
+        plain = {name: _cut_value(plain_value(value)) for name, value in values.items()}
         event = Event(time.time_ns(), level, text, pose_index, code, plain)
         pose = f"pose {pose_index + 1}: " if pose_index is not None else ""
         log.log(getattr(logging, level.upper()), "%s%s", pose, text)

@@ -7,16 +7,36 @@ import os
 import time
 from concurrent.futures import Future
 
+import msgspec
+import numpy as np
 import pytest
 
 from station.analysis import pool
 from station.analysis.pool import Workers
+from station.cell.status import EstimateStatus
 from tests.codes import raises
 from tests.patience import until
 
 
 def nothing() -> None:
     """Start without any preparation."""
+
+
+def estimate_of_numpy() -> EstimateStatus:
+    """What a function of the analysis made of NumPy's numbers."""
+    views = np.array([[1, 2], [0, 3]])
+    return EstimateStatus(np.int64(4), np.float64(0.5), enough=np.bool_(True), image_views=views)
+
+
+async def test_what_reaches_a_message_leaves_the_worker_as_plain_values() -> None:
+    workers = Workers(nothing)
+    try:
+        estimate = await workers.call(estimate_of_numpy)
+    finally:
+        workers.close()
+    assert estimate == EstimateStatus(4, 0.5, enough=True, image_views=((1, 2), (0, 3)))
+    msgspec.json.encode(estimate)
+    assert [type(each) for each in (estimate.views, estimate.predicted_error_mm)] == [int, float]
 
 
 class PoolThatNeverBegins:

@@ -17,7 +17,14 @@ import numpy as np
 import pytest
 
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import Event, LeaseStatus, StationState, StationStatus
+from station.cell.status import (
+    EstimateStatus,
+    Event,
+    GuidanceStatus,
+    LeaseStatus,
+    StationState,
+    StationStatus,
+)
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.messages import LINE_LIMIT_BYTES, Answer
 from station.protocol.verbs import Go
@@ -42,6 +49,7 @@ class RecordingHandler(SessionDispatcher):
     def __init__(self) -> None:
         self.order: list[str] = []
         self.lost: list[int] = []
+        self.unreadable: list[str] = []
         self.release = asyncio.Event()
 
     def stop_by_client(self, peer: Peer) -> Awaitable[object]:
@@ -60,6 +68,9 @@ class RecordingHandler(SessionDispatcher):
 
     def gone(self, peer: Peer) -> None:
         self.lost.append(peer.client_id)
+
+    def left_out(self, section: str) -> None:
+        self.unreadable.append(section)
 
 
 @pytest.fixture
@@ -126,6 +137,36 @@ async def test_a_status_that_cannot_be_encoded_makes_no_client_mute(server: Serv
         assert (await anext(statuses)).cell == "lab"
         async with Client(path) as second:
             assert (await anext(second.statuses())).cell == "lab"
+
+
+async def test_a_section_that_no_client_could_read_is_told_once_and_hides_no_other(
+    server: Served, handler: RecordingHandler
+) -> None:
+    control, path = server
+    async with Client(path) as first:
+        statuses = first.statuses()
+        await anext(statuses)
+        for cell in ("lab", "hall"):
+            publish(control, cell=cell, guidance=GuidanceStatus(still=math.nan, words=cell))
+            assert (await anext(statuses)).cell == cell
+        async with Client(path) as second:
+            assert (await anext(second.statuses())).cell == "hall"
+        assert handler.unreadable == ["guidance"]
+        publish(control, cell="lab", guidance=GuidanceStatus(words="turn it"))
+        assert (await anext(statuses)).guidance.words == "turn it"
+        publish(control, cell="lab", guidance=GuidanceStatus(still=math.nan))
+        assert handler.unreadable == ["guidance", "guidance"], "it could be sent meanwhile"
+
+
+async def test_a_section_that_cannot_even_be_compared_hides_no_other(server: Served) -> None:
+    control, path = server
+    async with Client(path) as client:
+        statuses = client.statuses()
+        await anext(statuses)
+        for cell in ("lab", "hall"):
+            publish(control, cell=cell, estimate=EstimateStatus(image_views=np.zeros((2, 3), int)))
+            assert (await anext(statuses)).cell == cell
+            assert client.connected
 
 
 async def test_who_was_answered_knows_what_came_of_it(tmp_path: Path) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from dataclasses import replace
 from typing import Any
 from unittest.mock import Mock
 
+import msgspec
+import numpy as np
 import pytest
 
 from calibrate.views.corners import NO_CORNERS
@@ -15,8 +18,9 @@ from recordings.reader import open_recording
 from recordings.recorder import Recorder
 from recordings.schema.messages import Image
 from station.analysis.worker import Sighting
-from station.cell.errors import CameraError, SafetyStopError, TriggerError
+from station.cell.errors import CameraError, RobotError, SafetyStopError, TriggerError
 from station.cell.status import StationState as S
+from station.protocol.messages import news_line
 from station.protocol.verbs import Purpose, Retake
 from station.session.recording import SessionRecording
 from tests.codes import raises
@@ -49,6 +53,27 @@ async def test_a_picture_without_the_board_does_not_count(rig: Rig) -> None:
     assert status.session.poses[0].reason == "board half hidden"
     assert status.cause == "failures"
     assert status.session.captured == 0
+
+
+@pytest.mark.parametrize(
+    "odd",
+    ["\ud800 half a pair", "x" * 1_000_000, np.float64(1.5), math.nan, np.array([1.0, 2.0]), {1, 2}],
+    ids=["surrogate", "long", "numpy", "nan", "array", "set"],
+)
+async def test_whatever_an_event_holds_the_recording_goes_on_and_screens_get_it_whole(
+    rig: Rig, odd: Any
+) -> None:
+    """Half a surrogate pair, as of a file's name, ended the recording: "Free space or mend the disk"."""
+    await rig.go_until_it_moves()
+    store = rig.session.store
+    store.event("odd", f"seen: {odd}", "warning", figure=odd, names=[odd])
+    store.problem(RobotError("odd", figure=odd), said="because of {}")
+    line, left_out = news_line(msgspec.structs.asdict(store.status), True)
+    assert not left_out and len(line) < 100_000
+    rig.arm.slow = False
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * POSES and sealed(rig)
 
 
 async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:

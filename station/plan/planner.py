@@ -249,15 +249,12 @@ def _describe(
     gained: Array,
     objective: Objective,
 ) -> Plan:
-    known = gained.cumsum(axis=0)
     model = layout.geometry.model
-    flange = forward(model, joints)
-    distance_m = median_distance_m(layout.camera_from_board(flange))
-    by_links = chain_of(model).by_links(joints) if options.criterion == "arm" else None
-    point = PointPrediction.of(layout.mount, layout.X, flange, distance_m, options.noise, by_links)
+    distance_m = median_distance_m(layout.camera_from_board(forward(model, joints)))
+    point = _point(layout, options, joints, distance_m)
     poses = tuple(
-        planned_pose(layout, number, q, predicted_error_m(total, objective.prior, point))
-        for number, (q, total) in enumerate(zip(joints, known, strict=True))
+        planned_pose(layout, number, q, error_m)
+        for number, (q, error_m) in enumerate(zip(joints, _errors_m(gained, objective, point), strict=True))
     )
     limits = layout.geometry.limits
     return Plan(
@@ -271,3 +268,40 @@ def _describe(
         working_distance_m=round(distance_m, 4),
         floor_m=round(point.floor_m, 9),
     )
+
+
+def _point(layout: CellLayout, options: PlanOptions, joints: Array, distance_m: float) -> PointPrediction:
+    """Predict for a point so far from the camera, at postures (n, 6)."""
+    model = layout.geometry.model
+    by_links = chain_of(model).by_links(joints) if options.criterion == "arm" else None
+    flange = forward(model, joints)
+    return PointPrediction.of(layout.mount, layout.X, flange, distance_m, options.noise, by_links)
+
+
+def _errors_m(gained: Array, objective: Objective, point: PointPrediction) -> list[float]:
+    """Predict the placed-point error after each view, by what each of them gains (n, p, p)."""
+    return [predicted_error_m(known, objective.prior, point) for known in gained.cumsum(axis=0)]
+
+
+def predicted_errors_m(
+    config: StationConfig, plan: Plan, taken: Sequence[int], *, lens_known: bool = False
+) -> list[float]:
+    """Predict the placed-point error (m) after each of the poses `taken`, where others of the plan are not.
+
+    taken: numbers of poses, in order. At the plan's working distance; with all poses as the plan itself says.
+    ConfigError when the configuration lacks what planning needs.
+    """
+    if not taken:
+        return []
+    layout = layout_of(config)
+    options = PlanOptions(criterion=plan.criterion or "A", free_intrinsics=not lens_known)
+    joints = np.array([plan.poses[index].joints_rad for index in taken], dtype=float)
+    flange, free = forward(layout.geometry.model, joints), options.free_intrinsics
+    if options.criterion == "arm":
+        gained = informations(layout, flange, joints, options.noise)
+        objective = arm_objective(layout, free, joints)
+    else:
+        gained = informations(layout, flange, None, options.noise)
+        objective = camera_objective(layout.camera, layout.board, layout.working_distance_m, free)
+    distance_m = plan.working_distance_m or median_distance_m(layout.camera_from_board(flange))
+    return _errors_m(gained, objective, _point(layout, options, joints, distance_m))

@@ -106,7 +106,7 @@ async def offered(context: SessionContext, motion: Motion, client_id: int) -> Mo
         top_speed_m_s=round(check.top_speed_m_s, 3),
         duration_s=round(check.duration_s + overhead_s, 1),
         first_move=f"{_displacement(context, start, plan.poses[0].joints_rad)} to pose {poses[0] + 1}",
-        warnings=tuple(await _warnings(context, state)),
+        warnings=(*_skipped(motion), *await _warnings(context, state)),
         stop_test=motion.stop_test,
     )
     return MotionApproval(motion, preview, client_id, start)
@@ -161,6 +161,15 @@ def _purpose_words(context: SessionContext, motion: Motion) -> str:
     if context.recording is None:
         return "run plan"
     return f"continue session {context.recording.name}"
+
+
+def _skipped(motion: Motion) -> list[str]:
+    """Say which poses of the plan a person skipped, perhaps in the session before."""
+    skipped, poses = motion.queue.skipped, len(motion.queue.statuses)
+    if motion.stop_test is not None or not skipped:
+        return []
+    numbers = ", ".join(str(index + 1) for index in skipped)
+    return [f"{len(skipped)} of {poses} poses are skipped: {numbers}; retake on Plan takes one back"]
 
 
 async def _warnings(context: SessionContext, state: RobotState) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 
@@ -46,6 +46,26 @@ class PoseQueue:
     @property
     def failed(self) -> tuple[int, ...]:
         return tuple(status.index for status in self._statuses if status.state == "failed")
+
+    @property
+    def skipped(self) -> tuple[int, ...]:
+        return tuple(status.index for status in self._statuses if status.state == "skipped")
+
+    @property
+    def predicted(self) -> tuple[int, ...]:
+        """Numbers of the poses that the plan's error counts: neither skipped nor failed."""
+        return tuple(s.index for s in self._statuses if s.state == "planned" or s.counts)
+
+    @property
+    def planned_errors_m(self) -> dict[int, float]:
+        """Pose number → placed-point error after it, as planned; without poses that have none."""
+        errors_m = {index: self.plan.predicted_error_m(index) for index in range(len(self.plan.poses))}
+        return {index: error_m for index, error_m in errors_m.items() if error_m is not None}
+
+    def predict(self, errors_m: Mapping[int, float]) -> None:
+        """Set the predicted errors: pose number → placed-point error after it; other poses have none."""
+        for index in range(len(self._statuses)):
+            self.note(index, predicted_sigma_mm=_mm(errors_m.get(index)))
 
     def pose(self, index: int) -> PlannedPose:
         return self.plan.poses[index]
@@ -129,6 +149,10 @@ def _planned(plan: Plan, index: int) -> PoseStatus:
         index,
         pose.name,
         why=pose.why,
-        predicted_sigma_mm=None if sigma_m is None else round(1000 * sigma_m, 4),
+        predicted_sigma_mm=_mm(sigma_m),
         base_from_flange=pose.base_from_flange,
     )
+
+
+def _mm(length_m: float | None) -> float | None:
+    return None if length_m is None else round(1000 * length_m, 4)

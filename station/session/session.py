@@ -36,6 +36,7 @@ from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
 from station.session.latch import Latch, LatchKeeper
 from station.session.motion import ApprovalManager, offered, session_motion
+from station.session.predictor import Predictor
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue, refused
 from station.session.run import Run
@@ -72,6 +73,7 @@ class Session:
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context, self.previews)
         self._estimator = Estimator(self.context)
+        self._predictor = Predictor(self.context)
         self._run: asyncio.Task[None] | None = None
         self._stops = 0
         """Number of STOPs: an acknowledgement is not of one that came after it was asked for."""
@@ -85,6 +87,7 @@ class Session:
         self.store.latched = self.latch.hold
         self.supervisor = SessionSupervisor(self.context, self.approvals.void, self.latch.hold)
         self.store.watch(self._estimator.poke)
+        self.store.watch(self._predictor.poke)
 
     async def start(self) -> None:
         """Connect devices (read-only, with retries) and restore a session that a crash interrupted."""
@@ -99,7 +102,8 @@ class Session:
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
         watching = self.supervisor.run, self.supervisor.monitor.watch_files
-        loops = (*watching, self.latch.run, self.devices.run, self._estimator.run, self.freedrive.run)
+        figures = self._estimator.run, self._predictor.run
+        loops = (*watching, self.latch.run, self.devices.run, *figures, self.freedrive.run)
         self._tasks = [asyncio.create_task(self.kept_going(loop)) for loop in loops]
 
     def _enter_latched(self, left: Latch) -> None:

@@ -62,8 +62,11 @@ def facts_line(known: Known) -> Content:
     session, goal_mm = known.shown.session, known.goal_mm
     if not (poses := session.poses):
         return dim(by_hand(known) if known.shown.robot.by_hand else NO_PLAN)
-    end_mm, _ = errors_after(poses, known.shown.estimate.floor_mm)[-1]
+    errors = [mm for mm, _ in errors_after(poses, known.shown.estimate.floor_mm) if mm is not None]
+    end_mm = errors[-1] if errors else None
     line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose")) + Content("   ")
+    if skipped := sum(pose.state == "skipped" for pose in poses):
+        line += Content.styled(f"{skipped} skipped   ", "$warn")
     line += error_facts("placed-point error at the end", end_mm, session.working_distance_m)
     if end_mm is not None and goal_mm is not None:
         line += Content("   ") + mark("done" if end_mm <= goal_mm else "look", f"goal {goal_mm:g} mm")

@@ -303,7 +303,9 @@ def _at_rest(known: Known, status: StationStatus) -> Action:
     if _to_judge(known, status.checked):
         return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
     if session.poses and not session.recording:
-        asks = f"Shows the motion to {many(len(session.poses), 'pose')} and asks first."
+        skipped = sum(pose.state == "skipped" for pose in session.poses)
+        left_out = f", {skipped} skipped," if skipped else ""
+        asks = f"Shows the motion to {many(len(session.poses) - skipped, 'pose')}{left_out} and asks first."
         return Action("F5", "Start the capture", f"{sentence(status.reason)} {asks}".strip())
     if result is not None:
         return _with_result(result, status)

@@ -26,7 +26,7 @@ from station.cell.layout import cell_geometry, layout_of
 from station.cell.limits import check_plan
 from station.plan.candidates import NOT_IN_PICTURE, OUT_OF_REACH, find_candidates
 from station.plan.choose import arm_objective, camera_objective, choose, informations
-from station.plan.planner import PlanOptions, make_plan, plan_layout
+from station.plan.planner import PlanOptions, make_plan, plan_layout, predicted_errors_m
 from station.plan.visibility import ViewRange, lens_radius, view_range, visible
 from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
@@ -94,6 +94,19 @@ def test_poses_are_varied_and_say_why_they_are_there():
     sigmas = [pose.predicted_sigma_m for pose in plan.poses]
     assert all(b <= a * (1 + 1e-9) for a, b in pairwise(sigmas))
     assert 0.0001 < plan.floor_m < sigmas[-1] < 0.0007
+
+
+@pytest.mark.parametrize("criterion", ["A", "arm"])
+def test_the_error_without_some_of_the_poses_is_predicted_as_with_all(criterion):
+    truth, config = cell()
+    plan = plan_layout(layout_of(config), replace(FEW, criterion=criterion), truth.start_joints_rad)
+    planned_m = [pose.predicted_sigma_m for pose in plan.poses]
+    every = range(len(plan.poses))
+    assert predicted_errors_m(config, plan, every) == pytest.approx(planned_m, rel=0.01)
+    half_m = predicted_errors_m(config, plan, every[::2])
+    assert len(half_m) == len(every[::2])
+    assert half_m[-1] > 1.05 * planned_m[-1]
+    assert predicted_errors_m(config, plan, ()) == []
 
 
 def test_all_poses_stand_in_one_arm_branch():

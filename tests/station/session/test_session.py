@@ -328,3 +328,25 @@ async def test_so_does_a_drift_check_that_did_not_begin(rig: Rig, small_plan: Pl
     await rig.until(S.IDLE)
     await until(lambda: len(rig.session.store.status.session.poses) == POSES)
     assert not rig.session.store.status.session.check and not rig.session.store.status.checked.name
+
+
+async def test_the_planned_error_counts_no_skipped_pose_and_skips_are_said_before_they_are_used_again(
+    rig: Rig,
+) -> None:
+    def errors() -> list[float | None]:
+        return [pose.predicted_sigma_mm for pose in rig.session.store.status.session.poses]
+
+    planned = errors()
+    assert not any("skipped" in warning for warning in (await rig.session.prepare(1)).warnings)
+    for index in (0, 2):
+        await rig.session.edit(1, Skip(index))
+    await until(lambda: errors()[0] is None and errors()[2] is None and errors()[3] != planned[3])
+    assert errors()[3] > planned[3]
+    await rig.session.edit(1, Retake(0))
+    await rig.session.edit(1, Retake(2))
+    await until(lambda: errors() == planned)
+    await rig.session.edit(1, Skip(1))
+    await rig.go_until(S.IDLE)
+    offer = await rig.session.prepare(1)
+    assert offer.poses == POSES - 1, "the next session leaves it out, too"
+    assert any("skipped" in warning and "2;" in warning for warning in offer.warnings)

@@ -40,8 +40,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     The text below a limit says when its gate closes.
     """
 
-    views: int | None = 8
-    """Fewer views were used."""
+    views: int | None = None
+    """Fewer views were used. Not stated: a warning below 8."""
     weight: float | None = None
     """The mean weight of the views is smaller: too many were rejected or count for little. Not stated: a
     warning below 80 %."""
@@ -75,10 +75,10 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     clock_bound_s: float | None = 0.02
     # An arm counts as settled below 2 mrad/s: in 0.02 s at most 0.04 mm at one metre.
     """Image and robot pose may be further apart in time."""
-    robot_error_m: float | None = 0.002
-    """The robot's positions are noisier."""
-    robot_error_deg: float | None = 0.3
-    """Its orientations are noisier."""
+    robot_error_m: float | None = None
+    """The robot's positions are noisier. Not stated: a warning above 2 mm."""
+    robot_error_deg: float | None = None
+    """Its orientations are noisier. Not stated: a warning above 0.3°."""
 
 
 STATION_ERROR_M = 0.002
@@ -118,11 +118,14 @@ def judge(
 
 
 ADVICE = {
+    "views": 8,
     "weight": 0.8,
     "rotation_deg": 30.0,
     "axis_spread": 0.1,
     "holdout_share": 0.01,
     "coverage": 0.25,
+    "robot_error_m": 0.002,
+    "robot_error_deg": 0.3,
 }
 """Gates that warn at these values where nobody states a limit: the stated error holds already what they miss.
 Whether it is true, `cross_validation` judges."""

@@ -28,7 +28,7 @@ from calibrate.handeye.pose_fit import PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline.gates import STATION_ERROR_M, GateLimits
+from calibrate.pipeline.gates import ADVICE, STATION_ERROR_M, GateLimits
 from calibrate.views.view_set import BoardView, ViewSet
 from recordings.errors import RecordingError
 from recordings.files import MAIN_CAMERA
@@ -142,13 +142,10 @@ def gates_would_pass(quick: QuickFit, error: QuickError, joints_known: bool) -> 
     from calibrate.handeye.estimate import REJECTED  # it loads scipy, the daemon needs none
 
     limits = GateLimits()
-    noise = quick.noise
     used = quick.fit.solved.chances[:, :2].sum(axis=1) > REJECTED
     judged_m = error.error_m if joints_known else error.from_x_m
     return bool(
-        used.sum() >= (limits.views or 0)
-        and noise.robot_m <= (limits.robot_error_m or np.inf)
-        and np.degrees(noise.robot_rad) <= (limits.robot_error_deg or np.inf)
+        used.sum() >= (limits.views or ADVICE["views"])
         and judged_m <= (limits.predicted_error_m or STATION_ERROR_M)
         and quick.fit.full.mean() >= _MOST
     )

@@ -21,6 +21,7 @@ from textual.command import DiscoveryHit, Hits, Provider
 from textual.screen import Screen
 from textual.system_commands import SystemCommandsProvider
 
+from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from station.cell.errors import StationError
 from station.cell.status import MotionPreview, SessionStatus, StationState, StationStatus
 from station.operate.motion import PREPARE_S, prepared_motion
@@ -41,7 +42,7 @@ from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.stop_key import run_behind_stop_key
-from station.tui.task import DIGITS, STEPS
+from station.tui.task import DIGITS, STEPS, too_few
 from station.tui.widgets.preview import PreviewPane, sharp_widget
 
 LOOK_S = 2.0
@@ -212,7 +213,10 @@ class StationApp(LivePageApp[None], DaemonApp):
     @work(exclusive=True, group="job", exit_on_error=False)
     async def action_solve_newest(self) -> None:
         session = self.known.shown.session
-        if session.recording:
+        if session.recording and session.captured < FEWEST_TO_SOLVE:
+            way = "F3 takes views by hand." if self.known.shown.robot.by_hand else "F5 captures again."
+            self.notify(f"{too_few(session.captured)} {way} Older sessions are on 5.", severity="warning")
+        elif session.recording:
             await solve_session(self.link, session.recording, session.folder)
         else:
             self.notify("Nothing is finished yet: F7 finishes a session; older ones are on 5.")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from calibrate.files.validity import validity_text
+from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from station.cell.config import StationConfig
 from station.cell.status import (
     NO_IMAGE,
@@ -311,7 +312,17 @@ def _at_rest(known: Known, status: StationStatus) -> Action:
         return _with_result(result, status)
     if not session.poses:
         return Action("F5", "Plan and start", "Plans, shows the motion and asks first.")
+    if session.captured < FEWEST_TO_SOLVE:
+        few = f"{too_few(session.captured)} F5 takes the plan again, n on 2 makes another."
+        return Action("F5", "Capture again", few, look=True)
     return Action("F9", "Solve", f"{many(session.captured, 'pose')} saved; solving takes some seconds.")
+
+
+def too_few(captured: int) -> str:
+    """Say that a finished session has too few poses to be solved."""
+    return (
+        f"{many(captured, 'pose') if captured else 'No pose'} saved: {FEWEST_TO_SOLVE} are needed to solve."
+    )
 
 
 def _to_judge(known: Known, checked: SessionStatus) -> bool:

@@ -85,4 +85,6 @@ def test_next_is_the_way_until_it_is_enough() -> None:
     silent = msgspec.structs.replace(by_hand(12), state=StationState.DISCONNECTED, guidance=GuidanceStatus())
     silent = with_robot(silent, by_hand=True)
     assert next_action(Known(silent)).on("capture").key == "1"
-    assert next_action(Known(in_session(silent, recording="session.mcap"))).key == "F9", "it needs no arm"
+    assert next_action(Known(in_session(silent, recording="session.mcap", captured=12))).key == "F9", (
+        "it needs no arm"
+    )

@@ -10,8 +10,19 @@ import pytest
 from station.cell.errors import RefusedError
 from station.cell.status import StationState
 from station.protocol import verbs
-from station.tui.dialogs import Confirm, ConfirmMotion
-from tests.tui.conftest import SUMMARY, FakeLink, app_on, commanded, idle, opened, said, text_of, until
+from station.tui.dialogs import Confirm, ConfirmMotion, JobScreen
+from tests.tui.conftest import (
+    SUMMARY,
+    FakeLink,
+    app_on,
+    commanded,
+    idle,
+    in_session,
+    opened,
+    said,
+    text_of,
+    until,
+)
 
 
 async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
@@ -174,3 +185,13 @@ async def test_what_a_stop_refused_is_not_said_any_more_after_it(link: FakeLink)
         link.refuse.clear()
         await pilot.press("f8")
         await until(pilot, lambda: not pilot.app._notifications)
+
+
+async def test_a_session_without_poses_to_solve_is_not_solved_and_its_key_names_the_way_out(
+    link: FakeLink,
+) -> None:
+    link.show(in_session(idle(), recording="/r/session.mcap", captured=0))
+    async with opened(link, notifications=True) as pilot:
+        await pilot.press("f9")
+        await until(pilot, lambda: "F5" in said(pilot))
+        assert not isinstance(pilot.app.screen, JobScreen)

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import (
+    CalibrationError,
     GateFailedError,
     InstallError,
     UsageError,
@@ -119,9 +120,18 @@ def install(
             _require_words(override)
             taken = Override(override.strip(), who(), overridden)
             calibration = msgspec.structs.replace(calibration, override=taken)
-        change = change_text(before, calibration)
+        change = "" if _is_withdrawn(folder) else change_text(before, calibration)
         validity = _first_validity(calibration, _max_age_days(folder, max_age_days))
         return add_version(folder, calibration, "install", validity, change, override.strip())
+
+
+def _is_withdrawn(folder: Path) -> bool:
+    """Tell whether what is installed was taken out of use; False where nothing is, or it is damaged."""
+    try:
+        number, _ = current_version(folder)
+    except CalibrationError:
+        return False
+    return read_validity_log(folder).of(number).state is ValidityState.WITHDRAWN
 
 
 def _first_validity(calibration: Calibration, max_age_days: float | None) -> Validity:
@@ -319,7 +329,7 @@ def _beside(
     """Compare a calibration with the installed one, or the newest undamaged one.
 
     That one, objections (another robot, camera or mounting, a missed touch test), and a failed gate where it
-    is much less certain.
+    is much less certain. A withdrawn one is no measure of how certain a calibration should be.
     """
     known = [g for g in installed_versions(root, camera) if g.calibration is not None]
     current = [g for g in known if g.current]
@@ -340,7 +350,8 @@ def _beside(
     if calibration.camera.name not in ("", camera):
         found.append(f"It is of the camera named {calibration.camera.name}, not {camera}.")
     found += [f"Touch test, {touch_text(t)}." for t in calibration.verification if not agrees(t)]
-    return before, found, _regression(calibration, before)
+    withdrawn = bool(current) and current[-1].validity.state is ValidityState.WITHDRAWN
+    return before, found, [] if withdrawn else _regression(calibration, before)
 
 
 def install_line(

@@ -49,7 +49,9 @@ class Installed:
 
     @property
     def held(self) -> str:
-        """INSTALLED, and its validity where that is not valid."""
+        """INSTALLED, and its validity where that is not valid; WITHDRAWN: programs are refused it."""
+        if self.withdrawn:
+            return "WITHDRAWN"
         if self.validity is None or self.validity.state is ValidityState.VALID:
             return "INSTALLED"
         return f"INSTALLED, {self.validity.state.replace('-', ' ')}"
@@ -156,6 +158,11 @@ class Result:
     @property
     def installed(self) -> bool:
         return self.calibration is not None and same_solve(self.calibration, self.state.now)
+
+    @property
+    def withdrawn(self) -> bool:
+        """It was installed, and a person took it out of use."""
+        return self.installed and self.state.withdrawn
 
     @property
     def taken(self) -> Override | None:

@@ -50,7 +50,12 @@ def verdict_lines(result: Result) -> Content:
     if result.verdict == "PASS WITH A REASON":
         said = accuracy_text(calibration)
     sign, _ = MARKS[VERDICTS[result.verdict]]
-    rows = [Content.styled(f"{sign} {result.verdict}, {became or new}\n{said}", "bold")]
+    head = f"{sign} {result.verdict}, {became or new}"
+    if result.withdrawn:
+        sign, _ = MARKS["failed"]
+        head = f"{sign} WITHDRAWN: out of use, programs are refused it. It was {result.verdict}."
+        said = accuracy_text(calibration)
+    rows = [Content.styled(f"{head}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID
         rows.append(Content.styled(sentence(validity_text(validity)), "bold $warn" if doubted else ""))
@@ -146,8 +151,12 @@ def evidence(result: Result, calibration: Calibration) -> Content:
 
 def change_lines(result: Result, calibration: Calibration) -> list[Content]:
     installed = result.state.now
+    if result.withdrawn:
+        return [mark("failed", "this one was installed, and is withdrawn")]
     if result.installed:
         return [mark("done", "this one is installed")]
+    if result.state.withdrawn:
+        return [dim("The one that was installed is withdrawn: nothing is compared with it.")]
     if installed is None:
         return [dim("Nothing is installed yet.")]
     if installed.mount != calibration.mount:
@@ -202,7 +211,10 @@ class ResultScreen(StationScreen):
         self._drawn = result
         verdict = self.query_one("#verdict", Static)
         doubted = result is not None and result.installed and result.state.doubted
-        verdict.set_classes("" if result is None else "-look" if doubted else f"-{VERDICTS[result.verdict]}")
+        kind = "" if result is None else "look" if doubted else VERDICTS[result.verdict]
+        if result is not None and result.withdrawn:
+            kind = "failed"
+        verdict.set_classes(f"-{kind}" if kind else "")
         verdict.update(Content(NO_RESULT) if result is None else verdict_lines(result))
         calibration = None if result is None else result.calibration
         self.query_one("#result").display = calibration is not None

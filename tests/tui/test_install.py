@@ -223,3 +223,16 @@ def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() ->
     told = verdict_lines(Result("", GOOD, state)).plain
     assert state.word(GOOD) == "INSTALLED, in doubt"
     assert "PASS, INSTALLED, in doubt" in told and reason.text in told
+
+
+def test_a_withdrawn_calibration_never_reads_as_one_that_is_installed() -> None:
+    reason = ValidityReason("withdrawn", "the camera was changed")
+    validity = Validity(1, ValidityState.WITHDRAWN, "2026-11-22T04:50:00+00:00", reason)
+    state = Installed(GOOD, validity=validity)
+    told = verdict_lines(Result("", GOOD, state)).plain
+    assert told.splitlines()[0].startswith("✗ WITHDRAWN") and "INSTALLED" not in told
+    assert reason.text in told
+    assert "INSTALLED" not in state.word(GOOD) and "INSTALLED" not in state.held
+    compared = evidence(Result("", LATER, state), LATER).plain
+    assert "from the one before" not in compared and "withdrawn" in compared
+    assert "from the one before" in evidence(Result("", LATER, Installed(GOOD)), LATER).plain

@@ -287,3 +287,14 @@ def test_what_speaks_against_it_beside_its_gates_is_known_before(make_file, tmp_
     newer = msgspec.structs.replace(now.provenance, software={"calibration-station": "9.0"})
     (stated_anew,) = objections_beside(msgspec.structs.replace(vaguer, provenance=newer), tmp_path)
     assert stated_anew.startswith(worse) and stated_anew != worse, "another version's error is no measure"
+
+
+def test_a_withdrawn_one_is_no_measure_for_the_next(make_file, tmp_path: Path) -> None:
+    install(make_file(), tmp_path)
+    now = installed_calibration(tmp_path)
+    vague = tuple(tuple(9 * value for value in row) for row in now.covariance)
+    vaguer = msgspec.structs.replace(now, covariance=vague)
+    assert objections_beside(vaguer, tmp_path)
+    withdraw(tmp_path, "the camera was changed")
+    assert objections_beside(vaguer, tmp_path) == []
+    assert install(make_file(0.001), tmp_path).change == ""

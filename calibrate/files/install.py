@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -303,9 +303,14 @@ def _require_words(reason: str) -> None:
         raise InstallError("reason-too-short")
 
 
-def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
-    """List what installing asks a reason for, besides failed gates, as `_beside` finds it."""
-    _, objections, worse = _beside(calibration, root, calibration.camera_name)
+def objections_beside(
+    calibration: Calibration, root: Path | None = None, known: Sequence[InstalledVersion] | None = None
+) -> list[str]:
+    """List what installing asks a reason for, besides failed gates, as `_beside` finds it.
+
+    `known`: the installed versions of its camera, where they were read already.
+    """
+    _, objections, worse = _beside(calibration, root, calibration.camera_name, known)
     return [*objections, *(gate.text for gate in worse)]
 
 
@@ -324,14 +329,19 @@ def change_text(before: Calibration | None, after: Calibration) -> str:
 
 
 def _beside(
-    calibration: Calibration, root: Path | None, camera: str
+    calibration: Calibration,
+    root: Path | None,
+    camera: str,
+    versions: Sequence[InstalledVersion] | None = None,
 ) -> tuple[Calibration | None, list[str], list[Gate]]:
     """Compare a calibration with the installed one, or the newest undamaged one.
 
     That one, objections (another robot, camera or mounting, a missed touch test), and a failed gate where it
     is much less certain. A withdrawn one is no measure of how certain a calibration should be.
     """
-    known = [g for g in installed_versions(root, camera) if g.calibration is not None]
+    if versions is None:
+        versions = installed_versions(root, camera)
+    known = [g for g in versions if g.calibration is not None]
     current = [g for g in known if g.current]
     before = (current or known)[-1].calibration if known else None
     found = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,7 +16,7 @@ from calibrate.files.folders import calibrations_folder, current_version, validi
 from calibrate.files.install import objections_beside
 from calibrate.files.validity import Validity, ValidityState, parse_time
 from calibrate.files.validity_log import FILE as VALIDITY_FILE
-from calibrate.files.versions import LogEntry, read_log, same_solve
+from calibrate.files.versions import InstalledVersion, LogEntry, installed_versions, read_log, same_solve
 from recordings.files import MAIN_CAMERA
 from station.cell.session_folder import CALIBRATION_FILE, SessionSummary, list_sessions
 from station.cell.status import SessionStatus
@@ -183,10 +184,22 @@ def read_result(path: str) -> Result:
     try:
         root, calibration = state_root(path), read_calibration(Path(path))
         state = read_installed(root, calibration.camera_name)
-        found = [] if same_solve(calibration, state.now) else objections_beside(calibration, root)
+        found = objections_of(calibration, root, state)
     except CalibrationError as problem:
         return Result(path, problem=str(problem))
-    return Result(path, calibration, state, tuple(found))
+    return Result(path, calibration, state, found)
+
+
+def objections_of(
+    calibration: Calibration,
+    root: Path,
+    state: Installed,
+    known: Sequence[InstalledVersion] | None = None,
+) -> tuple[str, ...]:
+    """List what installing would ask a reason for; none where it is installed. `known`: all versions."""
+    if same_solve(calibration, state.now):
+        return ()
+    return tuple(objections_beside(calibration, root, known))
 
 
 @dataclass(frozen=True)
@@ -200,15 +213,27 @@ class Kept:
     """Its calibration is or was installed; else empty."""
     check: CheckEntry | None = None
     """The verdict of the drift check that it was recorded for."""
+    verdict: Verdict = "FAIL"
+    """Of its calibration, as Result says it."""
 
 
 def read_sessions(root: Path, camera: str) -> tuple[Kept, ...]:
     """Read what became of each session, newest first; for a thread."""
     installed = read_installed(root, camera)
+    versions = list[InstalledVersion]()
+    with suppress(CalibrationError, OSError):
+        versions = installed_versions(root, camera)
     judged = {check.recording: check for check in installed.checks}
     kept = []
     for session in list_sessions(root):
         made = readable(Path(session.calibration)) if session.calibration else None
-        word = "" if made is None else installed.word(made)
-        kept.append(Kept(session, made, word, judged.get(session.name)))
+        if made is None:
+            kept.append(Kept(session, check=judged.get(session.name)))
+            continue
+        ours = versions if made.camera_name == camera else None
+        found = tuple[str, ...]()
+        with suppress(CalibrationError, OSError):
+            found = objections_of(made, root, installed, ours)
+        shown = Result(session.calibration, made, installed, found)
+        kept.append(Kept(session, made, installed.word(made), judged.get(session.name), shown.verdict))
     return tuple(kept)

@@ -92,7 +92,7 @@ def _row(kept: Kept) -> tuple[Content, ...]:
     if found is not None:
         figure = figures(found)["error"]
         error = facts(("", figure.value, figure.about))
-        verdict = mark(VERDICTS[found.verdict], found.verdict)
+        verdict = mark(VERDICTS[kept.verdict], kept.verdict)
         became = became or "solved, not installed"
     elif check is not None:
         verdict = mark("done" if check.passed else "failed", "PASS" if check.passed else "FAIL")

@@ -16,7 +16,7 @@ from calibrate.files.versions import note_installed, who
 from station.cell.pose_plan import Plan
 from station.cell.session_folder import SessionState, write_state
 from station.tui import app as app_module
-from station.tui.installed import read_installed
+from station.tui.installed import read_installed, read_result, read_sessions
 from station.tui.sessions import _row
 from station.tui.task import next_action
 from tests.tui.conftest import FakeLink, after_check, app_on, idle, in_session, opened, text_of, until
@@ -167,3 +167,17 @@ async def test_the_result_of_the_session_just_captured_needs_no_picking(link: Fa
         (root / "later.yaml").rename(folder / "calibration.yaml")  # another program solved it
         await pilot.press("4")
         await until(pilot, lambda: "Session s-1" in text_of(app, "#verdict"))
+
+
+@pytest.mark.parametrize("instead", [False, True])
+async def test_a_session_has_the_verdict_that_result_shows(link: FakeLink, root: Path, instead: bool) -> None:
+    """Of a missed touch test, and of one that is installed with a reason."""
+    path = root / "sessions" / "s-2" / "calibration.yaml"
+    write_calibration(msgspec.structs.replace(solve_of(root, "s-2"), verification=[OFF]), path)
+    if instead:
+        install(path, root, cell="simulated", override="measured with the tape")
+    found = {kept.session.name: kept for kept in read_sessions(root, "main")}
+    assert found["s-2"].verdict == read_result(str(path)).verdict == "PASS WITH A REASON"
+    assert "PASS WITH A REASON" in _row(found["s-2"])[2].plain
+    other = read_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
+    assert found["s-1"].verdict == other.verdict

@@ -62,9 +62,7 @@ async def check_drift(link: DaemonLink, approves: Approve) -> None:
 
 async def install_result(link: DaemonLink, result: Result, calibration: Calibration) -> None:
     """Ask, then install. A simulated result installs on a simulated cell only."""
-    session = calibration.provenance.session
-    body = f"Session {session} becomes what every program of this cell reads. b undoes it."
-    if not await link.ask_person(Confirm("Install this calibration?", body, yes="Install")):
+    if not await link.ask_person(install_question(result, calibration)):
         return
     live = link.known.live
     cell: Cell = "simulated" if live is not None and live.source == "simulated" else "real"
@@ -74,6 +72,23 @@ async def install_result(link: DaemonLink, result: Result, calibration: Calibrat
     if await link.attempt(_installed(link, put)) is not None:
         link.app.result_path = link.app.result_path  # the same, but its file is read again
         link.app.notify("Installed. b undoes it.")
+
+
+def install_question(result: Result, calibration: Calibration) -> Confirm:
+    """Ask whether to install, and say first what speaks against it."""
+    session = calibration.provenance.session
+    against = [f"✗ {gate.text}" for gate in calibration.quality.failed]
+    against += [f"▲ {objection}" for objection in result.objections]
+    if not against:
+        body = f"Session {session} becomes what every program of this cell reads. b undoes it."
+        return Confirm("Install this calibration?", body, yes="Install")
+    title = "Install it with a reason?"
+    if calibration.quality.failed:
+        title = "It FAILED. Install it all the same?"
+    reads = (
+        f"Session {session} would become what every program of this cell reads. Your reason is asked next."
+    )
+    return Confirm(title, "\n".join([*against, "", reads]), yes="Give a reason")
 
 
 async def _installed(link: DaemonLink, put: partial[InstalledVersion]) -> InstalledVersion | None:

@@ -19,10 +19,12 @@ from calibrate.files.install import install, installed_calibration
 from calibrate.files.touch import Touch
 from calibrate.files.validity import Validity, ValidityReason, ValidityState
 from calibrate.files.versions import installed_versions, note_installed
+from calibrate.results import Gate
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import StationState
 from station.tui.dialogs import Confirm, Reason
 from station.tui.installed import Installed, Result, local, read_installed
+from station.tui.jobs import install_question
 from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
@@ -151,7 +153,7 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
             await pilot.press(answer)
             await until(pilot, lambda: not isinstance(pilot.app.screen, Reason))
         await until(pilot, lambda: validity_of(calibrations_folder(root), 1).state == "withdrawn")
-        await until(pilot, lambda: "withdrawn" in text_of(pilot.app, "#verdict"))
+        await until(pilot, lambda: "WITHDRAWN" in text_of(pilot.app, "#verdict"))
         assert next_action(pilot.app.known).key != "d"
         await pilot.press("b")
         await until(pilot, lambda: "out of use" in said(pilot))
@@ -236,3 +238,18 @@ def test_a_withdrawn_calibration_never_reads_as_one_that_is_installed() -> None:
     compared = evidence(Result("", LATER, state), LATER).plain
     assert "from the one before" not in compared and "withdrawn" in compared
     assert "from the one before" in evidence(Result("", LATER, Installed(GOOD)), LATER).plain
+
+
+def test_the_question_before_installing_says_what_speaks_against_it() -> None:
+    def asked(calibration: Calibration, *objections: str) -> tuple[str, str]:
+        question = install_question(Result("", calibration, objections=objections), calibration)
+        return str(question.title), question.words
+
+    failing = Gate("views", False, 3.0, 8.0, "only 3 of 8 views")
+    quality = msgspec.structs.replace(GOOD.quality, gates=(failing,))
+    title, words = asked(msgspec.structs.replace(GOOD, quality=quality), "another camera")
+    assert "FAIL" in title and "only 3 of 8 views" in words and "another camera" in words
+    reasoned, words = asked(GOOD, "another camera")
+    assert "FAIL" not in reasoned and "another camera" in words
+    plain, words = asked(GOOD)
+    assert len({title, reasoned, plain}) == 3 and "b undoes it" in words

@@ -143,6 +143,11 @@ def read_acceptance(root: Path) -> Acceptance | None:
         return None
 
 
+def accept_line(speed_m_s: float) -> str:
+    """Make the command that tests the stops up to this speed."""
+    return f"station accept --speed {speed_m_s:g}"
+
+
 def not_accepted(found: Acceptance | None, subject: ArmSubject, speed_m_s: float = 0.0) -> str:
     """Say why the stops of this arm are not accepted at this speed; empty: they are."""
     if found is None:
@@ -152,5 +157,8 @@ def not_accepted(found: Acceptance | None, subject: ArmSubject, speed_m_s: float
     if not found.accepted:
         return "not accepted: the last test of its stops failed or was ended"
     if found.speed_m_s < speed_m_s:
-        return f"not accepted beyond {found.speed_m_s:g} m/s: the cell's limit is {speed_m_s:g} m/s"
+        return (
+            f"not accepted beyond {found.speed_m_s:g} m/s: the cell's limit is {speed_m_s:g} m/s, for which "
+            f"`{accept_line(speed_m_s)}` tests them"
+        )
     return ""

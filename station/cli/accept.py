@@ -23,6 +23,7 @@ from station.cell.arm_acceptance import (
     Figure,
     StopResult,
     StopWay,
+    accept_line,
     read_acceptance,
     write_acceptance,
 )
@@ -96,14 +97,19 @@ async def _accept(socket: Path | None, joint: int, speed_m_s: float, quiet: bool
             raise
         _keep(root, acceptance)
         if not quiet:
-            words, style = _verdict(acceptance)
+            words, style = _verdict(acceptance, min(config.limits.speed_m_s, SPEED_CAP_M_S))
             err.print(words, style=style)
         return acceptance
 
 
-def _verdict(acceptance: Acceptance) -> tuple[str, str]:
+def _verdict(acceptance: Acceptance, limit_m_s: float) -> tuple[str, str]:
+    """Say how the test ended. `limit_m_s`: speed that the cell allows, for which it may not be accepted."""
     if acceptance.accepted:
-        return f"ACCEPTED up to {acceptance.speed_m_s:g} m/s", "green"
+        words = f"ACCEPTED up to {acceptance.speed_m_s:g} m/s"
+        if acceptance.speed_m_s >= limit_m_s:
+            return words, "green"
+        missing = f"The cell's limit is {limit_m_s:g} m/s: next `{accept_line(limit_m_s)}`"
+        return f"{words}. {missing}, or set limits.speed_m_s to {acceptance.speed_m_s:g}.", "yellow"
     if any(result.failed for result in acceptance.results):
         return "NOT ACCEPTED", "bold red"
     return "NOT MEASURED: nothing speaks against the arm. Reduce this computer's load and repeat.", "yellow"

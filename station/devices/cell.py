@@ -64,8 +64,12 @@ class Cell:
             return ""
         if not self.arm.identity.controller_version or not self.mover.control_path:  # not connected
             return ""
-        speed_m_s = min(self.config.limits.speed_m_s, SPEED_CAP_M_S)
-        return not_accepted(read_acceptance(root), self.subject, speed_m_s)
+        return not_accepted(read_acceptance(root), self.subject, self.speed_limit_m_s)
+
+    @property
+    def speed_limit_m_s(self) -> float:
+        """Highest speed of any modelled point: what the stops have to be accepted for."""
+        return min(self.config.limits.speed_m_s, SPEED_CAP_M_S)
 
     @property
     def config_sha256(self) -> str:

@@ -10,6 +10,7 @@ from calibrate.errors import CalibrationError
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState, validity_text
 from recordings.plain_text import bytes_text
+from station.cell.arm_acceptance import accept_line
 from station.cell.errors import CameraError, RobotError, TriggerError
 from station.cell.process import GRANT_REAL_TIME, in_real_time
 from station.cell.session_folder import require_writable
@@ -20,7 +21,10 @@ from station.protocol.verbs import Check
 from station.session.context import SessionContext
 from station.session.threads import ASKED
 
-NOT_ACCEPTED_REMEDY = "run `station accept`; until then: low speed slider, a hand on the emergency stop"
+NOT_ACCEPTED_REMEDY = (
+    "run `station accept`, and for the speed that this cell allows `{}`; until then: low speed slider, a "
+    "hand on the emergency stop"
+)
 
 
 async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[Check]:
@@ -70,7 +74,8 @@ def _control_check(context: SessionContext, mover: Mover) -> Check:
     if trouble:
         return Check("control", "failed", trouble, remedy)
     if trouble := context.cell.acceptance_trouble(context.root):
-        return Check("control", "warning", f"{path}, {trouble}", NOT_ACCEPTED_REMEDY)
+        remedy = NOT_ACCEPTED_REMEDY.format(accept_line(context.cell.speed_limit_m_s))
+        return Check("control", "warning", f"{path}, {trouble}", remedy)
     return Check("control", "ok", path) if path else Check("control", "skipped", "no arm moves")
 
 

@@ -140,7 +140,7 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
     style = "bold $strong" if robot.condition.safety == "NORMAL" else "bold $warn"
     yield Content.assemble(("  safety ", "$dim"), (safe, style))
     if robot.not_accepted:
-        yield Content.styled("  not accepted", "$warn")
+        yield Content.styled(f"  {robot.not_accepted.partition(':')[0]}", "$warn")
     yield Content.assemble(
         ("  ", ""),
         (f"{robot.speed_m_s:.2f}", "bold $strong"),

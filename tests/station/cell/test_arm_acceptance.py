@@ -47,6 +47,7 @@ def test_it_holds_up_to_the_speed_that_passed() -> None:
     slow = msgspec.structs.replace(PASSED, speed_m_s=0.05)
     assert not_accepted(slow, SUBJECT, 0.25) and not not_accepted(slow, SUBJECT, 0.05)
     assert not not_accepted(PASSED, SUBJECT, 0.25)
+    assert "--speed 0.25" in not_accepted(slow, SUBJECT, 0.25), "the speed that is missing, to be typed"
 
 
 def test_never_tested_failed_and_unreadable_are_not_accepted(tmp_path: Path) -> None:

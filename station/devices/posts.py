@@ -81,8 +81,11 @@ def _pose(numbers: Sequence[float | tuple[float, ...]], written: Convention | No
         return _converted([*flat, *(x for row in rows for x in row)], written)
     if len(flat) == 7 and not rows:
         return _by_quaternion(flat)
-    if flat or [len(row) for row in rows] != [4] * 4:
-        raise StaleStateError("post-unreadable", reason="a pose has 7 numbers, or 4 rows of 4")
+    if len(flat) == 16 and not rows:
+        rows = [tuple(flat[start : start + 4]) for start in range(0, 16, 4)]
+    elif flat or [len(row) for row in rows] != [4] * 4:
+        reason = "a pose has 7 numbers, 16 row by row, or 4 rows of 4"
+        raise StaleStateError("post-unreadable", reason=reason)
     matrix = np.array(rows)
     if not np.isfinite(matrix).all() or not is_rigid(matrix, UNIT_TOLERANCE):
         raise StaleStateError("post-rotation", problem="the matrix is no rotation and place, row by row")

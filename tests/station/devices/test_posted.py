@@ -24,7 +24,7 @@ from station.cell.errors import RobotError
 from station.cell.stillness import StillnessMonitor
 from station.devices import posted
 from station.devices.posted import PAUSE_S, PostedArm
-from station.devices.posts import read_declaration
+from station.devices.posts import read_declaration, read_post
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
 from tests.station.session_rig import memory_config
@@ -402,3 +402,15 @@ async def test_a_refused_program_is_told_so_although_it_has_nothing_more_to_say(
     if not typed:
         await posting.communicate(b'{"source": "live", "robot": "another arm"}\n')
     assert await posting.wait() == 1
+
+
+def test_a_matrix_is_read_as_rows_and_as_its_numbers_row_by_row() -> None:
+    rows = [[0.0, -1.0, 0.0, 0.3], [1.0, 0.0, 0.0, -0.4], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]]
+    poses = []
+    for written in (rows, [number for row in rows for number in row]):
+        _, pose = read_post(json.dumps({"base_from_flange": written}).encode(), None)
+        poses.append(pose)
+    assert poses[0] == poses[1] == pytest.approx((0.3, -0.4, 0.5, 0.0, 0.0, np.pi / 2))
+    by_columns = np.array(rows).T.ravel().tolist()
+    with raises("post-rotation"):
+        read_post(json.dumps({"base_from_flange": by_columns}).encode(), None)

@@ -225,6 +225,7 @@ NEEDS: dict[str, Callable[[Known], object]] = {
     **dict.fromkeys(("act('undo')", "app.drift_check"), lambda now: now.result and now.result.state.now),
     **dict.fromkeys(("report", "act('touch test')"), lambda now: now.result),
     **dict.fromkeys(("pose('retake')", "pose('skip')"), lambda now: now.shown.session.poses),
+    "retake_failed": lambda now: any(pose.state == "failed" for pose in now.shown.session.poses),
     **dict.fromkeys(("act('solve')", "act('check')"), lambda now: now.sessions),
     "take_back": lambda now: now.shown.session.captured,
     "act('recover')": lambda now: not all(kept.session.sealed for kept in now.sessions or ()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal
@@ -26,6 +27,7 @@ COLUMNS = ("#", "error", "state", "reason")
 NO_PLAN = "No plan yet: F5 makes one and asks, n only makes it."
 BY_HAND = "A person moves this arm: F3 takes views, and needs no plan."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
+FAILED = "Capture all failed poses again at the next run"
 SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses: takes some seconds, nothing moves"
 NEW_PLAN = MakePlan(25, seed=1)
@@ -81,6 +83,7 @@ class PlanScreen(StationScreen):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("n", "make", "New", tooltip=NEW),
         Binding("r", "pose('retake')", "Retake", tooltip=RETAKE),
+        Binding("a", "retake_failed", "Retake failed", tooltip=FAILED),
         Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
     ]
 
@@ -119,6 +122,14 @@ class PlanScreen(StationScreen):
             self.notify("No plan is loaded: n makes one, or `station plan` in a shell.", severity="warning")
         elif (pose := self._chosen()) is not None:
             self.ask(POSE_VERBS[verb](pose.index))
+            self.table.move_cursor(row=self.table.cursor_row + 1)
+
+    @work(exclusive=True, group="retake failed", exit_on_error=False)
+    async def action_retake_failed(self) -> None:
+        """Plan every failed pose again, one request after the other; the first refusal ends it."""
+        for pose in self.known.shown.session.poses:
+            if pose.state == "failed" and await self.link.ask(Retake(pose.index)) is None:
+                return
 
     def action_make(self) -> None:
         self.ask(NEW_PLAN, PREPARE_S)

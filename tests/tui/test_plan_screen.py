@@ -84,3 +84,26 @@ def test_of_an_arm_that_tells_no_joints_it_says_what_they_would_win() -> None:
     assumed = ARM_CLASSES["industrial-six"].title
     assert assumed in told(silent) and assumed not in told(posted)
     assert assumed not in told(with_robot(posted, state=None)), "nobody knows yet what it tells"
+
+
+async def test_retake_goes_on_to_the_next_pose_and_one_key_retakes_all_that_failed(link: FakeLink) -> None:
+    failed = (3, 7, 24)
+    status = idle()
+    poses = [
+        msgspec.structs.replace(pose, state="failed" if pose.index in failed else "done")
+        for pose in status.session.poses
+    ]
+    async with opened(link) as pilot:
+        await pilot.press("2")
+        assert not pilot.app.screen.does_something("retake_failed"), "nothing failed"
+        link.show(in_session(status, poses=tuple(poses)))
+        await until(pilot, lambda: pilot.app.screen.does_something("retake_failed"))
+        await pilot.press("r", "r")
+        await until(pilot, lambda: link.verbs.count("retake") == 2)
+        assert verbs.Retake(0) in link.asked and verbs.Retake(1) in link.asked
+        link.asked.clear()
+        await pilot.press("a")
+        await until(pilot, lambda: len(link.verbs) == len(failed))
+        assert [verb for verb in link.asked if isinstance(verb, verbs.Retake)] == [
+            verbs.Retake(index) for index in failed
+        ]

@@ -32,7 +32,7 @@ from station.protocol.verbs import PreviewImage, Purpose
 from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
 from station.tui.daemon_link import SILENT_S, DaemonApp, DaemonLink, TerminalWatch
-from station.tui.dialogs import Confirm, ConfirmMotion
+from station.tui.dialogs import Confirm, ConfirmFinish, ConfirmMotion
 from station.tui.installed import Marks, marks, read_result, read_sessions, solved_file, state_root
 from station.tui.jobs import check_drift, solve_session
 from station.tui.live_page import SIDE_PX, LivePageApp, news_of
@@ -261,13 +261,11 @@ class StationApp(LivePageApp[None], DaemonApp):
 
     @work(exclusive=True, group="finish", exit_on_error=False)
     async def action_finish(self) -> None:
-        live, session = self.known.live, self.known.shown.session
+        live = self.known.live
         if live is not None and (refusal := verbs.Finish.refusal(live.state)) is not None:
             self.notify(str(refusal), severity="warning")
             return
-        captured = f"{session.captured} of {len(session.poses)} poses are captured."
-        body = f"{captured} The recording is closed; F9 then solves it."
-        if await self.link.ask_person(Confirm("Finish this session?", body, yes="Finish")):
+        if await self.link.ask_person(ConfirmFinish()):
             await self.link.ask(verbs.Finish())
 
     @work(exclusive=True, group="command", exit_on_error=False)

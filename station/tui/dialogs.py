@@ -59,6 +59,22 @@ class Confirm(Question[bool]):
         self.dismiss(event.button.id == "yes")
 
 
+class ConfirmFinish(Confirm):
+    """Ask whether to finish the session; the poses are counted anew while the arm goes on."""
+
+    def __init__(self) -> None:
+        super().__init__("Finish this session?", "", yes="Finish")
+
+    def show(self, known: Known) -> None:
+        super().show(known)
+        session = known.shown.session
+        captured = f"{session.captured} of {len(session.poses)} poses are captured."
+        end = "The pose under way is captured first. " if known.works else ""
+        body = f"{captured} {end}The recording is then closed; F9 solves it."
+        for words in self.query("#confirm-body").results(Static):
+            words.update(Content(body))
+
+
 class ConfirmMotion(Confirm):
     """Approve exactly this motion, once, while the station still holds it."""
 

@@ -195,3 +195,15 @@ async def test_a_session_without_poses_to_solve_is_not_solved_and_its_key_names_
         await pilot.press("f9")
         await until(pilot, lambda: "F5" in said(pilot))
         assert not isinstance(pilot.app.screen, JobScreen)
+
+
+async def test_the_question_to_finish_counts_the_poses_while_the_arm_goes_on(link: FakeLink) -> None:
+    async with opened(link) as pilot:
+        for captured in (6, 9):
+            link.show(in_session(commanded(StationState.MOVING), captured=captured))
+            if captured == 6:
+                await until(pilot, lambda: pilot.app.known.works)
+                await pilot.press("f7")
+            await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
+            count = f"{captured} of 25"
+            await until(pilot, lambda count=count: count in text_of(pilot.app, "#confirm-body"))

@@ -91,8 +91,8 @@ class StationApp(LivePageApp[None], DaemonApp):
         Binding("f7", "finish", "Finish", tooltip="Finish with the poses so far"),
         Binding("f8", "acknowledge", "Acknowledge", priority=True, tooltip="Look; then leave STOPPED, FAULT"),
         Binding("f9", "solve_newest", "Solve", tooltip="Solve the session just recorded"),
-        Binding("f3", "freedrive", "Freedrive", tooltip="Begin or end capture by hand"),
-        Binding("f2", "ask('record')", "Image", tooltip="Capture an image here (freedrive)"),
+        Binding("f3", "freedrive", "By hand", tooltip="Begin or end capture by hand"),
+        Binding("f2", "ask('record')", "Image", tooltip="Capture an image here (by hand)"),
         Binding(
             "o", "open_live", "Live picture", show=False, tooltip="The live picture, large, in a browser"
         ),

@@ -269,7 +269,7 @@ class Framed(Screen[R]):
             if not self.does_something(action):
                 keys[key] = active._replace(binding=replace(shown, show=False))
             elif action == "freedrive" and self.known.hand_guided:
-                keys[key] = active._replace(binding=replace(shown, description="End freedrive"))
+                keys[key] = active._replace(binding=replace(shown, description="End by hand"))
         return keys
 
     def does_something(self, action: str) -> bool:

@@ -15,7 +15,7 @@ from station.cell.status import StationState, StationStatus
 
 STATE_WORDS = {state: state.value.upper() for state in StationState} | {
     StationState.DISCONNECTED: "NO ROBOT",
-    StationState.FREE_DRIVE: "FREEDRIVE",
+    StationState.FREE_DRIVE: "BY HAND",
 }
 
 Mark = Literal["done", "now", "stopped", "look", "failed", "todo"]

@@ -47,12 +47,12 @@ async def test_the_wanted_view_is_drawn_a_view_sounds_and_is_taken_back(link: Fa
     app.bell = lambda: bells.append(1)
     async with app.run_test(size=(120, 36)) as pilot:
         await until(pilot, lambda: app.known.live is not None)
-        await until(pilot, lambda: footer(app).get("f3") == "Freedrive")
+        await until(pilot, lambda: footer(app).get("f3") == "By hand")
         await pilot.press("f3")
         await until(pilot, lambda: verbs.Freedrive(True) in link.asked)
         await until(pilot, lambda: app.current_mode == "capture")  # where the wanted view is drawn
         link.show(by_hand(2))
-        await until(pilot, lambda: footer(app).get("f3") == "End freedrive")
+        await until(pilot, lambda: footer(app).get("f3") == "End by hand")
         pane = app.screen.query_one(PreviewPane)
         await until(pilot, lambda: outlined(pane) > 20)
         assert not bells, "these views were taken before this screen saw the session"
@@ -62,7 +62,7 @@ async def test_the_wanted_view_is_drawn_a_view_sounds_and_is_taken_back(link: Fa
         await until(pilot, lambda: verbs.Skip(2) in link.asked)
         link.show(msgspec.structs.replace(by_hand(3), state=StationState.SETTLING))
         await until(pilot, lambda: app.known.shown.state is StationState.SETTLING)
-        await until(pilot, lambda: footer(app).get("f6") and footer(app).get("f3") == "End freedrive")
+        await until(pilot, lambda: footer(app).get("f6") and footer(app).get("f3") == "End by hand")
         await pilot.press("f3")  # ends it after the view that is being taken
         await until(pilot, lambda: verbs.Pause() in link.asked)
         link.show(msgspec.structs.replace(by_hand(3), state=StationState.STOPPED))

@@ -156,7 +156,7 @@ class StationApp(LivePageApp[None], DaemonApp):
         if status is None:
             self.known = replace(self.known, gone=why, silent_s=None)
             return
-        self.known = replace(self.known, status=status, gone="")
+        self.known = replace(self.known, status=status, gone="", own_id=self.link.client.own_id)
         if before is None or before.session.recording != status.session.recording:
             self.look_at_disk()
         if before is not None and status.session.name not in ("", before.session.name):

@@ -275,7 +275,7 @@ class Framed(Screen[R]):
     def does_something(self, action: str) -> bool:
         """Tell whether the action of a key is possible now."""
         verb, status = ASKS.get(action), self.known.shown
-        if verb is not None and self.known.old:
+        if verb is not None and (self.known.old or (verb.control and self.known.in_control)):
             return False
         if action == "freedrive" and self.known.hand_guided:
             return True

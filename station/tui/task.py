@@ -25,6 +25,8 @@ from station.tui.words import UNKNOWN, Mark, duration, many, sentence
 
 STEPS = ("connect", "plan", "capture", "result")
 DIGITS = {mode: str(place) for place, mode in enumerate((*STEPS, "sessions", "log"), start=1)}
+NEED_CONTROL = ("F2", "F3", "F5", "F7", "n")
+"""Keys of the one next action that are refused while another client has control."""
 _STILL = {StationState.IDLE, StationState.PAUSED, StationState.FREE_DRIVE}
 
 
@@ -77,6 +79,8 @@ class Known:
     """Why there is no daemon; empty: there is one, or none was asked yet."""
     configuration: StationConfig | None = None
     """Facts of the cell; None until the daemon told them."""
+    own_id: int | None = None
+    """The number by which the lease names this screen; None: not told yet."""
     sessions: tuple[Kept, ...] | None = None
     """Recorded sessions below the daemon's root, newest first; None: not read yet."""
 
@@ -105,6 +109,14 @@ class Known:
     def blind(self) -> bool:
         """No picture is live: the status is old, or the camera gives no image."""
         return self.old or self.shown.detection.cause == NO_IMAGE
+
+    @property
+    def in_control(self) -> str:
+        """Who else has control, so that this screen's keys for it would be refused; empty: nobody."""
+        lease = self.shown.lease
+        if self.live is None or self.own_id is None or lease.client_id in (None, self.own_id):
+            return ""
+        return lease.holder
 
     @property
     def works(self) -> bool:
@@ -222,6 +234,9 @@ def next_action(known: Known) -> Action:
         why = " ".join(words for words in (known.busy, status.reason) if words)
         return Action("", "Wait", why, look=bool(status.reason))
     action = _by_state(known, status) or _at_rest(known, status)
+    if known.in_control and action.key in NEED_CONTROL:
+        why = f"{known.in_control} has control, and gives it back there. F12 stops the arm from here too."
+        return Action("", "Only watch", why, look=True)
     if status.robot.by_hand and action.key in ("F5", "n"):
         why = " ".join(
             words for words in (sentence(status.reason), "You move the arm, it is only read.") if words

@@ -207,3 +207,18 @@ async def test_the_question_to_finish_counts_the_poses_while_the_arm_goes_on(lin
             await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
             count = f"{captured} of 25"
             await until(pilot, lambda count=count: count in text_of(pilot.app, "#confirm-body"))
+
+
+@pytest.mark.parametrize(("holder", "offered"), [(7, True), (8, False)])
+async def test_a_screen_beside_the_one_in_control_offers_no_key_that_is_refused(
+    link: FakeLink, holder: int, offered: bool
+) -> None:
+    link.show(commanded(StationState.PAUSED, holder))
+    async with opened(link, size=(120, 36)) as pilot:
+        await until(pilot, lambda: "PAUSED" in text_of(pilot.app, "#bar"))
+        screen = pilot.app.screen
+        assert [screen.does_something(action) for action in ("run", "finish")] == [offered] * 2
+        await until(pilot, lambda: ("F5" in text_of(pilot.app, "#next")) is offered)
+        assert ("anna on tty1" in text_of(pilot.app, "#next")) is not offered
+        await pilot.press("f12")
+        await until(pilot, lambda: "stop" in link.verbs)

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -262,6 +263,16 @@ def _reduced(image: Pixels, box: Box | None) -> NDArray[np.float32]:
         next(n for n in range(n, 0, -1) if cv2.getOptimalDFTSize(n) % 2 == 0) for n in small.shape
     )
     return np.asarray(small[:rows, :columns], dtype=np.float32)
+
+
+def smaller_image(taken: Image, side_px: int) -> Image:
+    """Reduce an image whose longer side is longer than this, and interpolate its colour mosaic."""
+    pixels = viewable(taken.pixels, taken.pixel_format)
+    scale = side_px / max(pixels.shape[:2])
+    if scale >= 1.0:
+        return taken
+    small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return msgspec.structs.replace(taken, pixels=small)
 
 
 def preview_image(taken: Image, corners: Array, width: int, height: int, sequence: int) -> PreviewImage:

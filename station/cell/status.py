@@ -150,10 +150,12 @@ class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
 NO_IMAGE = "no-image"
 NOT_LOOKED = "not-looked"
+OLD_S = 2.0
+"""Age from which an image, and what it shows of the board, is told to be old; one lost frame is no news."""
 
 
 class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Board detection in the newest preview or captured image."""
+    """Board detection in the newest preview or captured image, at most `OLD_S` old."""
 
     found: bool = False
     reason: str = ""
@@ -168,7 +170,11 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Why no board was found, or over-exposed, under-exposed, blurred, `NO_IMAGE`, or `NOT_LOOKED`: the
     computer is too busy to look for it in the newest images; empty: all is well."""
     advice: str = ""
-    """What is wrong with light or focus, and what to set; empty: nothing."""
+    """What is wrong with light or focus, and what to set, or that the computer is busy; empty: nothing."""
+
+
+NOTHING_SEEN = DetectionStatus(reason="not looked at for the board", cause=NOT_LOOKED)
+"""Of no image, or of none that is younger than `OLD_S`."""
 
 
 class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -323,7 +329,7 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     robot: RobotStatus = RobotStatus()
     camera: CameraStatus = CameraStatus()
     trigger: TriggerStatus = TriggerStatus()
-    detection: DetectionStatus = DetectionStatus()
+    detection: DetectionStatus = NOTHING_SEEN
     recorder: RecorderStatus = RecorderStatus()
     session: SessionStatus = SessionStatus()
     checked: SessionStatus = SessionStatus()

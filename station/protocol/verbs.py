@@ -131,6 +131,8 @@ class PreviewImage(msgspec.Struct, frozen=True, omit_defaults=True):
     corners: tuple[tuple[float, float], ...] = ()
     """The board's corners, as shares of the image's sides."""
     sequence: int = 0
+    age_s: float = 0.0
+    """Age of the image, and of what was seen in it, when this was answered; no corners from 2 s on."""
 
 
 class Observation(msgspec.Struct, frozen=True, omit_defaults=True):

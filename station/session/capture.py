@@ -135,7 +135,7 @@ async def _write(context: SessionContext, index: int, image: Image, view: View, 
     await recording.sync()
     if sighting is not None:
         queue.note(index, corners=len(sighting.detection.corners))
-        context.store.update(detection=detection_status(sighting))
+        context.store.show_detection(detection_status(sighting))
         flange = np.array(view.base_from_flange)
         context.seen.pop(index, None)  # the newest comes last
         joints = None if view.joints_rad is None else np.array(view.joints_rad)

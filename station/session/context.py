@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import shlex
@@ -21,7 +22,17 @@ from recordings.schema.messages import CaptureEvent, RobotState, Stamps
 from station.analysis.pool import Workers
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionState
-from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus, differ
+from station.cell.status import (
+    NOTHING_SEEN,
+    OLD_S,
+    DetectionStatus,
+    Event,
+    Level,
+    SessionStatus,
+    StationState,
+    StationStatus,
+    differ,
+)
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import wait_for_state
 from station.devices.cell import Cell
@@ -283,6 +294,8 @@ class StatusStore:
     def __init__(self, status: StationStatus) -> None:
         self.status = status
         self._watchers: list[Callable[[], None]] = []
+        self._detection_ends: asyncio.TimerHandle | None = None
+        """When the shown detection is old; None: there was none yet."""
         self.recorded: Callable[[Event], None] = lambda event: None
         """Called for every event, to record it."""
         self.latched: Callable[[str, str, StationState], None] = lambda reason, cause, state: None
@@ -308,6 +321,19 @@ class StatusStore:
 
     def update_session(self, **fields: object) -> None:
         self.update(session=msgspec.structs.replace(self.status.session, **fields))
+
+    def show_detection(self, detection: DetectionStatus, lasts_s: float = OLD_S) -> None:
+        """Show what an image shows of the board until that is old: then the board is not looked at.
+
+        So whoever reads the status never takes it for the present, also where nobody asks for images any
+        more, or the worker ended or hangs.
+        """
+        if self._detection_ends is not None:
+            self._detection_ends.cancel()
+        self.update(detection=detection)
+        self._detection_ends = asyncio.get_running_loop().call_later(
+            lasts_s, lambda: self.update(detection=NOTHING_SEEN)
+        )
 
     def enter(self, state: StationState, reason: str | CodedError = "", cause: str = "") -> None:
         """Enter a state; `reason` is for people, `cause` for programs. TransitionError: not allowed."""

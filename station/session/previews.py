@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from calibrate.boards.detect import detect
@@ -14,10 +16,10 @@ from recordings.geometry import base_from_flange
 from recordings.images import viewable
 from recordings.schema.messages import BoardSpec, Image
 from station.analysis.pool import WorkerError
-from station.analysis.worker import Sighting, detection_status, preview_image, sight
+from station.analysis.worker import Sighting, detection_status, preview_image, sight, smaller_image
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import NO_IMAGE, NOT_LOOKED, DetectionStatus, StationState
+from station.cell.status import NO_IMAGE, NOT_LOOKED, OLD_S, DetectionStatus, StationState
 from station.cell.stillness import NotStillError
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Observation, Observe, PreviewImage
@@ -26,14 +28,18 @@ from station.session.context import SessionContext
 
 PREVIEW_PERIOD_S = 0.1
 SIDES = (16, 1024)
-OLD_S = 2.0
-"""Age of the newest image, or of the newest one in which the board was looked for, from which screens are
-told so; one lost frame is no news."""
 LOOK_S = 0.5
-"""Longest wait for the board to be found in an image before the image is shown without it."""
-PATIENCE_S, PATIENCE_IN_A_RUN_S = 30.0, 5.0
+"""Longest wait for the board to be found in an image before the image is shown without it; a search that
+takes longer is slow, and the next images are made smaller."""
+QUICK_S = 0.05
+"""Longest search in a smaller image after which images are searched as they come again."""
+BUSY = "the computer is busy: a smaller picture is looked at"
+PATIENCE_S = 30.0
+PATIENCE_IN_A_RUN_S = 15.0
 """Longest time that looking for the board may take, on a busy computer, before the worker counts as hanging.
 In a run the capture waits behind it."""
+NO_IMAGE_S = 5.0
+"""Time for which it is told that no image came: longer than until the next try."""
 _OBSERVE_S = 5.0
 _TAKING = (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING)
 
@@ -46,6 +52,7 @@ class Looked(NamedTuple):
     """When the image came (host monotonic)."""
     sighting: Sighting | None
     """None: the worker hung or died."""
+    took_s: float
 
 
 class Previewer:
@@ -64,6 +71,8 @@ class Previewer:
         """When the newest image came."""
         self._looked_s = 0.0
         """When the newest image came in which the board was looked for."""
+        self._slow = False
+        """Searches take long: images are made smaller."""
         self._looking: asyncio.Task[Looked] | None = None
         """The search for the board in an image, which may take longer than the next image does."""
         self._count = 0
@@ -71,7 +80,7 @@ class Previewer:
     async def look(self) -> tuple[Image, Sighting] | None:
         """Return an image and the board in it, however long that takes; None without one."""
         await self._renew()
-        if self._picture is not None and self._sighting is not None:
+        if self._picture is not None and self._sighting is not None and self._age_s <= OLD_S:
             return self._picture, self._sighting
         if self._looking is None:
             return None
@@ -85,8 +94,16 @@ class Previewer:
             return PreviewImage()
         low, high = SIDES
         width, height = min(max(width, low), high), min(max(height, low), high)
-        corners = np.zeros((0, 2)) if self._sighting is None else self._sighting.detection.corners.pixels
-        return await asyncio.to_thread(preview_image, self._picture, corners, width, height, self._count)
+        age_s, corners = self._age_s, np.zeros((0, 2))
+        if self._sighting is not None and age_s <= OLD_S:
+            corners = self._sighting.detection.corners.pixels
+        made = await asyncio.to_thread(preview_image, self._picture, corners, width, height, self._count)
+        return msgspec.structs.replace(made, age_s=round(age_s, 2))
+
+    @property
+    def _age_s(self) -> float:
+        """Age of the newest image, and of the board in it."""
+        return time.monotonic() - self._seen_s
 
     async def _renew(self) -> None:
         async with self._taking:
@@ -125,46 +142,54 @@ class Previewer:
         """
         context = self._context
         self._taken_s = time.monotonic()
-        ours = 1 if self._looking is not None else 0
-        if context.store.state in _TAKING or context.workers.waiting > ours:
-            return  # camera or worker are needed by the capture
+        if context.store.state in _TAKING:
+            return  # the capture needs the camera
         try:
             image = await context.cell.camera.glimpse()
         except StationError as error:
             if self._taken_s - self._seen_s > OLD_S:
-                context.store.update(detection=DetectionStatus(reason=f"no image: {error}", cause=NO_IMAGE))
+                missing = DetectionStatus(reason=f"no image: {error}", cause=NO_IMAGE)
+                context.store.show_detection(missing, NO_IMAGE_S)
             return
+        if self._slow:
+            image = await asyncio.to_thread(smaller_image, image, SIDES[1])
         self._seen_s = self._taken_s
         self._picture = image
         self._sighting = await self._sighted(image)
+        if self._seen_s - self._looked_s > OLD_S:
+            reason = "not looked at for the board: the computer is busy"
+            self._tell(DetectionStatus(reason=reason, cause=NOT_LOOKED), NO_IMAGE_S)
         self._count += 1
 
     async def _sighted(self, image: Image) -> Sighting | None:
         """Look for the board in the newest image, for `LOOK_S`, and tell the screens what is seen.
 
-        None: it takes longer, or the search in an earlier image does. Then the image is shown without its
-        board.
+        None: it takes longer, or the worker is at other work, such as a plan or the search in an earlier
+        image. Then the image is shown without its board.
         """
         if self._looking is None:
+            if self._context.workers.waiting:
+                return None
             self._looking = asyncio.create_task(self._look_in_worker(image, self._seen_s))
             await asyncio.wait({self._looking}, timeout=LOOK_S)
-        sighting: Sighting | None = None
-        if self._looking.done():
-            looked = self._looking.result()
-            self._looking = None
-            if looked.sighting is not None:
-                self._looked_s = looked.taken_s
-                self._tell(detection_status(looked.sighting))
-            sighting = looked.sighting if looked.image is image else None
-        if self._seen_s - self._looked_s > OLD_S:
-            reason = "not looked at for the board: the computer is busy"
-            self._tell(DetectionStatus(reason=reason, cause=NOT_LOOKED))
-        return sighting
+        if not self._looking.done():
+            return None
+        looked = self._looking.result()
+        self._looking = None
+        self._slow = looked.took_s > (QUICK_S if self._slow else LOOK_S)
+        if looked.sighting is None:
+            return None
+        self._looked_s = looked.taken_s
+        status = detection_status(looked.sighting)
+        if self._slow and not status.advice:
+            status = msgspec.structs.replace(status, advice=BUSY)
+        self._tell(status, looked.taken_s + OLD_S - time.monotonic())
+        return looked.sighting if looked.image is image else None
 
-    def _tell(self, detection: DetectionStatus) -> None:
-        """Tell the screens; in a capture they are told of its own image."""
-        if self._context.store.state not in _TAKING:
-            self._context.store.update(detection=detection)
+    def _tell(self, detection: DetectionStatus, lasts_s: float) -> None:
+        """Tell the screens, for so long; in a capture they are told of its own image."""
+        if self._context.store.state not in _TAKING and lasts_s > 0:
+            self._context.store.show_detection(detection, lasts_s)
 
     async def _look_in_worker(self, image: Image, taken_s: float) -> Looked:
         """Look for the board in the worker."""
@@ -172,7 +197,9 @@ class Previewer:
         config = context.cell.config
         exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
         patience_s = PATIENCE_IN_A_RUN_S if context.store.state in RUNNING else PATIENCE_S
-        try:
+        began_s = time.monotonic()
+        sighting = None
+        with contextlib.suppress(WorkerError):
             sighting = await context.workers.call(
                 sight,
                 viewable(image.pixels, image.pixel_format),
@@ -183,9 +210,7 @@ class Previewer:
                 config.camera.name,
                 timeout_s=patience_s,
             )
-        except WorkerError:
-            sighting = None
-        return Looked(image, taken_s, sighting)
+        return Looked(image, taken_s, sighting, time.monotonic() - began_s)
 
 
 def _require_between_sessions(context: SessionContext) -> None:

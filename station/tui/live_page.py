@@ -23,7 +23,7 @@ from typing import TypeVar
 import msgspec
 
 from recordings.cli.console import open_in_browser
-from station.cell.status import DetectionStatus, GuidanceStatus, StationState
+from station.cell.status import OLD_S, DetectionStatus, GuidanceStatus, StationState
 from station.protocol.verbs import PreviewImage
 from station.tui.capture_panels import quality_line
 from station.tui.frame import bar_line
@@ -59,7 +59,9 @@ def news_of(known: Known, picture: PreviewImage) -> dict[str, object]:
     if status.state is not StationState.FREE_DRIVE:
         guidance = msgspec.structs.replace(guidance, still=float(status.robot.still))
     bar, saved = bar_line(known, "Live", 1000).plain.strip(), status.session.captured
-    return news(bar, next_action(known), status.detection, guidance, saved, picture) | {"old": known.blind}
+    return news(bar, next_action(known), status.detection, guidance, saved, picture) | {
+        "old": known.blind or picture.age_s > OLD_S
+    }
 
 
 def news(

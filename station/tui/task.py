@@ -10,6 +10,7 @@ from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from station.cell.config import StationConfig
 from station.cell.status import (
     NO_IMAGE,
+    NOT_LOOKED,
     DetectionStatus,
     GuidanceStatus,
     SessionStatus,
@@ -304,6 +305,8 @@ def to_wanted(guidance: GuidanceStatus, seen: DetectionStatus) -> Action:
     """Tell the way from what is seen to the wanted view."""
     if seen.cause == NO_IMAGE:
         return Action("", "No image", sentence(seen.reason), look=True)
+    if seen.cause == NOT_LOOKED:
+        return Action("", "Wait", sentence(seen.reason), look=True)
     if not seen.found:
         return Action("", "Show the whole board", seen.reason)
     why = guidance.warning or "The outline in the picture shows it. A new view is taken when all is still."

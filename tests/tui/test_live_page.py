@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from station.cell.status import GuidanceStatus, StationState
+from station.cell.status import DetectionStatus, GuidanceStatus, StationState
 from station.tui import live_page
 from station.tui.live_page import BROWSERS, LivePage
 from tests.patience import PATIENCE_S, wait_until
@@ -183,7 +183,8 @@ async def test_chromium_shows_picture_next_action_and_what_is_saved(
     link: FakeLink, tmp_path: Path, desktop: Path
 ) -> None:
     guidance = GuidanceStatus(outline=((0.25, 0.25), (0.5, 0.25), (0.5, 0.5)), still=0.4)
-    by_hand = msgspec.structs.replace(idle(StationState.FREE_DRIVE), guidance=guidance)
+    seen = DetectionStatus(reason="no board")
+    by_hand = msgspec.structs.replace(idle(StationState.FREE_DRIVE), guidance=guidance, detection=seen)
     link.show(in_session(by_hand, captured=4))
     async with opened(link) as pilot:
         await pilot.press("o")

@@ -24,6 +24,7 @@ from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
+from station.cell.status import OLD_S
 from station.protocol import verbs
 from station.protocol.client import Client
 from station.tui.themes import TERMINAL, chosen_theme
@@ -83,6 +84,8 @@ class PreviewPane(Widget):
     """The widget for sharp images; None: half blocks only."""
     old: reactive[bool] = reactive(False)
     """The image is out of date; written across it."""
+    dated: reactive[bool] = reactive(False)
+    """The daemon has had no newer image for seconds, as while it is at other work."""
     wanted: reactive[Outline] = reactive(())
     """Corners of the board in the wanted view, in order, as shares of the image's sides; drawn as a line."""
     calm: reactive[bool] = reactive(True)
@@ -109,6 +112,7 @@ class PreviewPane(Widget):
 
     def show(self, answer: verbs.PreviewImage) -> None:
         """Show an image, if there is one and it does not stand there already."""
+        self.dated = answer.age_s > OLD_S
         if answer.sequence == self._sequence or not answer.jpeg_base64:
             return
         data = np.frombuffer(base64.b64decode(answer.jpeg_base64), dtype=np.uint8)
@@ -123,7 +127,7 @@ class PreviewPane(Widget):
 
     def _sharp(self) -> bool:
         """Tell whether a sharp image may stand here: it would hide what is drawn over it."""
-        if self.sharp is None or self.old or not self.calm or not self.screen.is_active:
+        if self.sharp is None or self._stale or not self.calm or not self.screen.is_active:
             return False
         return not any(part.display for part in self.screen.query("Toast, Tooltip, Stopped"))
 
@@ -159,7 +163,15 @@ class PreviewPane(Widget):
         for child in self.children:
             child.display = False
 
+    @property
+    def _stale(self) -> bool:
+        return self.old or self.dated
+
     def watch_old(self) -> None:
+        self.soften()
+
+    def watch_dated(self) -> None:
+        self._rows_size = Size(0, 0)  # without the corners
         self.soften()
 
     def watch_wanted(self) -> None:
@@ -185,7 +197,7 @@ class PreviewPane(Widget):
             return Strip.blank(self.size.width, self.rich_style)
         if self._rows_size != self.size:
             self._rows, self._rows_size = self._draw(self.size), self.size
-        if self.old and self._image is not None and y == self.size.height // 2:
+        if self._stale and self._image is not None and y == self.size.height // 2:
             return Strip([Segment(OLD.center(self.size.width), Style(reverse=True, bold=True))])
         return self._rows[y] if y < len(self._rows) else Strip.blank(self.size.width, self.rich_style)
 
@@ -209,7 +221,7 @@ class PreviewPane(Widget):
         self._outline(lined, (1,))
         for row, column in np.argwhere(lined).tolist():
             cells[row][column] = _WANTED
-        for x, y in self._corners:
+        for x, y in () if self.dated else self._corners:
             row, column = int(y * rows) // 2, int(x * columns)
             if 0 <= row < rows // 2 and 0 <= column < columns:
                 cells[row][column] = _CORNER

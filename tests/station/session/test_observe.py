@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import Any
 
 import msgspec
@@ -14,7 +15,7 @@ from calibrate.boards.model import board_points
 from calibrate.views.corners import Corners
 from recordings.errors import CodedError
 from recordings.geometry import base_from_flange
-from recordings.schema.messages import BoardKind, BoardSpec
+from recordings.schema.messages import BoardKind, BoardSpec, Image, Stamps
 from station.analysis.pool import WorkerError
 from station.cell.errors import CameraError
 from station.cell.status import NO_IMAGE, NOT_LOOKED
@@ -111,8 +112,8 @@ async def test_a_silent_camera_is_told_and_one_lost_frame_is_not(
     await look()
     assert not told()
     monkeypatch.setattr(previews, "OLD_S", 0.0)
-    await look()
-    assert told()
+    assert await look() is None
+    await until(told)
 
 
 @pytest.mark.parametrize("worker", ["slow", "hangs"])
@@ -174,3 +175,57 @@ async def test_a_screen_that_closes_takes_no_look_from_the_others(
     answer.set()
     await until(lambda: ended)
     assert ended == [True]
+
+
+async def test_what_was_seen_ends_by_itself_where_nobody_asks_and_with_its_picture(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`station status` told the corners of minutes ago where no screen asked for pictures."""
+    status = lambda: rig.session.store.status.detection  # noqa: E731
+    assert status().cause == NOT_LOOKED, "nothing was looked at yet"
+    first = await rig.session.previews.preview(64, 64)
+    assert status().found and first.corners and first.age_s < 1.0
+    monkeypatch.setattr(previews, "PREVIEW_PERIOD_S", 3600.0)
+    monkeypatch.setattr(previews.time, "monotonic", lambda before=time.monotonic: before() + 60.0)
+    late = await rig.session.previews.preview(64, 64)
+    assert late.sequence == first.sequence and late.age_s > 59.0 and not late.corners
+    assert await rig.session.previews.look() is None, "nobody is guided by an old picture"
+    await until(lambda: status().cause == NOT_LOOKED)
+
+
+async def test_while_the_worker_is_at_other_work_the_picture_goes_on_and_says_so(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(previews, "PREVIEW_PERIOD_S", 0.0)
+    first = await rig.session.previews.preview(64, 64)
+    rig.worker.waiting = 1
+    monkeypatch.setattr(previews, "OLD_S", 0.0)
+    second = await rig.session.previews.preview(64, 64)
+    assert second.sequence > first.sequence and not second.corners
+    assert await rig.session.previews.look() is None
+    rig.worker.waiting = 0
+
+
+async def test_after_a_slow_search_a_smaller_picture_is_searched_and_that_is_said(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that was only slow was killed and started anew every six seconds."""
+    call, sides, clock = rig.worker.call, [], [0.0]
+
+    async def noted(function: Any, *arguments: Any, **named: Any) -> Any:
+        sides.append(arguments[0].shape[1])
+        clock[0] += 1.0 if arguments[0].shape[1] > 1024 else 0.01
+        return await call(function, *arguments, **named)
+
+    async def large() -> Image:
+        return Image(np.zeros((1600, 2000), np.uint8), Stamps(), 0, 0)
+
+    monkeypatch.setattr(previews, "PREVIEW_PERIOD_S", 0.0)
+    monkeypatch.setattr(previews.time, "monotonic", lambda: 1000.0 + clock[0])
+    monkeypatch.setattr(rig.camera, "glimpse", large)
+    monkeypatch.setattr(rig.worker, "call", noted)
+    said = []
+    for _ in range(4):
+        await rig.session.previews.look()
+        said.append(rig.session.store.status.detection.advice == previews.BUSY)
+    assert sides == [2000, 1024, 2000, 1024] and said == [True, False, True, False]

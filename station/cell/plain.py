@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from recordings.errors import plain_value
+from recordings.schema.messages import Image
 
 R = TypeVar("R")
 
@@ -23,9 +24,10 @@ def plain_struct(made: R) -> R:
     """Convert every field of a message's struct to its declared type, here where it was made.
 
     A number of NumPy's in it would be found by whoever encodes it, somewhere else and later. What is no
-    struct comes back as it is. msgspec.ValidationError where a field holds another kind of thing.
+    struct comes back as it is, and so does an image, which is no message. msgspec.ValidationError where a
+    field holds another kind of thing.
     """
-    if not isinstance(made, msgspec.Struct):
+    if not isinstance(made, msgspec.Struct) or isinstance(made, Image):
         return made
     return msgspec.convert(builtins_of(made), type(made))
 

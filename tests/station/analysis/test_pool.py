@@ -6,16 +6,18 @@ import asyncio
 import os
 import time
 from concurrent.futures import Future
+from copy import copy
 
 import msgspec
 import numpy as np
 import pytest
 
+from recordings.schema.messages import Image, Stamps
 from station.analysis import pool
 from station.analysis.pool import Workers
 from station.cell.status import EstimateStatus
 from tests.codes import raises
-from tests.patience import until
+from tests.patience import PATIENCE_S, until
 
 
 def nothing() -> None:
@@ -105,3 +107,14 @@ async def test_a_call_that_is_late_is_given_up_and_the_next_one_gets_a_new_proce
         assert await workers.call(os.getpid) != first
     finally:
         workers.close()
+
+
+async def test_an_image_comes_out_of_the_worker_as_it_was_made() -> None:
+    """Those of the simulated camera, which are no messages."""
+    image = Image(np.zeros((2, 3), np.uint8), Stamps(), 0, 0)
+    workers = Workers()
+    try:
+        came = await workers.call(copy, image, timeout_s=PATIENCE_S)
+    finally:
+        workers.close()
+    assert came.pixels.shape == (2, 3) and came.pixels.dtype == np.uint8

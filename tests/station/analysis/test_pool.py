@@ -112,7 +112,7 @@ async def test_a_call_that_is_late_is_given_up_and_the_next_one_gets_a_new_proce
 async def test_an_image_comes_out_of_the_worker_as_it_was_made() -> None:
     """Those of the simulated camera, which are no messages."""
     image = Image(np.zeros((2, 3), np.uint8), Stamps(), 0, 0)
-    workers = Workers()
+    workers = Workers(nothing)
     try:
         came = await workers.call(copy, image, timeout_s=PATIENCE_S)
     finally:

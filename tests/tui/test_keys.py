@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -10,7 +11,8 @@ import pytest
 from station.cell.errors import RefusedError
 from station.cell.status import StationState
 from station.protocol import verbs
-from station.tui.dialogs import Confirm, ConfirmMotion, JobScreen
+from station.tui.dialogs import Confirm, ConfirmFinish, ConfirmMotion, JobScreen, Reason
+from station.tui.frame import Question
 from tests.tui.conftest import (
     SUMMARY,
     FakeLink,
@@ -154,6 +156,41 @@ async def test_help_and_enter_do_nothing_that_a_person_did_not_choose(link: Fake
         await pilot.press("enter")
         await pilot.pause()
         assert link.verbs == before
+
+
+def kinds_of(kind: type[Question[Any]]) -> set[type[Question[Any]]]:
+    """Every kind of question that the screens may ask."""
+    direct = set(kind.__subclasses__())
+    return direct.union(*map(kinds_of, direct))
+
+
+MADE: dict[str, Callable[[], Question[Any]]] = {
+    "Confirm": lambda: Confirm("Sure?", "It ends.", yes="End"),
+    "ConfirmFinish": ConfirmFinish,
+    "ConfirmMotion": lambda: ConfirmMotion(SUMMARY),
+    "Reason": lambda: Reason("Why?", "Enter does it."),
+}
+NOTHING_TO_APPROVE = {"JobScreen", "TouchCorners"}
+"""Work that a person began, and positions that are read."""
+
+
+async def test_enter_alone_says_yes_to_no_question(link: FakeLink) -> None:
+    """Whoever adds a kind of question adds it here."""
+    assert {kind.__name__ for kind in kinds_of(Question)} - NOTHING_TO_APPROVE == MADE.keys()
+    async with opened(link) as pilot:
+        for make in MADE.values():
+            answers: list[Any] = []
+            question = make()
+            await pilot.app.push_screen(question, answers.append)
+            await until(pilot, lambda question=question: question.focused is not None)
+            await pilot.press("enter")
+            await pilot.pause()
+            assert not any(answers)
+            if not answers:
+                await pilot.press("escape")
+                await until(pilot, lambda answers=answers: answers)
+                assert not any(answers)
+        assert link.verbs == []
 
 
 @pytest.mark.parametrize(

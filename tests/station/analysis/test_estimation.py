@@ -12,6 +12,7 @@ import pytest
 from calibrate.boards.model import board_points
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.placed_point import PointPrediction
+from calibrate.pipeline.gates import STATION_ERROR_M
 from calibrate.views.corners import Corners
 from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
@@ -159,3 +160,9 @@ def test_one_wrong_view_is_left_out_and_of_many_the_session_is_in_doubt(moved: i
         for view in views_of("eye-in-hand", 15, 3e-5)
     ]
     assert running_estimate(config, truth.camera, True, views).enough is enough
+
+
+def test_where_the_goal_alone_says_enough_what_solving_will_refuse_is_not() -> None:
+    """A goal above the limit of the gate: it is reached, and the recording would FAIL."""
+    said = estimated("eye-in-hand", 25, 1e-3, goal_m=0.01)
+    assert 1000 * STATION_ERROR_M < said.predicted_error_mm < 10.0 and not said.enough

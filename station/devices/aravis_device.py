@@ -50,6 +50,15 @@ def _aravis() -> tuple[Any, Any]:
     return Aravis, GLib
 
 
+def genicam_problem() -> CameraError | None:
+    """Return why this program can open no GenICam camera at all; None: its library is there."""
+    try:
+        _aravis()
+    except CameraError as problem:
+        return problem
+    return None
+
+
 class GenicamDevice:
     """One GenICam camera; blocking, for use by one thread. All methods raise CameraError."""
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 
 from station.cell.config import CameraChoice, CameraConfig
+from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
+from station.devices.aravis_device import genicam_problem
 from station.devices.base import Camera
 from station.devices.discovery import discover, discover_usb
 from station.devices.ur import GuidedArm
@@ -29,6 +31,10 @@ class RealHardware:
         genicam = [CameraChoice("aravis", serial, f"{model} {serial}") for model, serial in known]
         webcams = [CameraChoice("webcam", node, f"{name}, webcam") for node, name in discover_webcams()]
         return (*genicam, *webcams)
+
+    async def genicam_problem(self) -> CameraError | None:
+        """Return why no GenICam camera can be opened here, whatever is connected; None: one can."""
+        return await asyncio.to_thread(genicam_problem)
 
     async def camera(self, found: CameraChoice, exposure_us: float) -> Camera:
         """Open it with this exposure time. Raises CameraError."""

@@ -17,7 +17,7 @@ from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, Rob
 from station.analysis.hand_guide import HandGuide
 from station.analysis.worker import Sighting, detection_status, sight
 from station.cell.config import CameraChoice, StillnessConfig
-from station.cell.errors import StationError
+from station.cell.errors import CameraError, StationError
 from station.cell.status import DetectionStatus, GuidanceStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import Camera
@@ -43,6 +43,8 @@ class CellSetup:
         self.arm: GuidedArm | None = None
         self.camera: Camera | None = None
         self.cameras: tuple[CameraChoice, ...] = ()
+        self.genicam_problem: CameraError | None = None
+        """Why no GenICam camera can be opened, where none was found; None: one can be."""
         self.seen: Sighting | None = None
         """The board in the newest image; None: it was not looked for."""
         self.counts: tuple[int, int] | None = None
@@ -91,6 +93,7 @@ class CellSetup:
         """Search for cameras; True when the list changed. A single one is opened, where none is yet."""
         found = await self._hardware.cameras()
         changed, self.cameras = found != self.cameras, found
+        self.genicam_problem = None if found else await self._hardware.genicam_problem()
         if len(found) == 1 and self.camera is None:
             await self.open(found[0])
         return changed

@@ -121,6 +121,8 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
             return Action("Enter", "On to the camera", why)
         case CellStep.CAMERA if setup.camera is None and setup.cameras:
             return Action("Enter", "Show this camera", "Up and Down choose another.")
+        case CellStep.CAMERA if setup.camera is None and setup.genicam_problem is not None:
+            return Action("", "Connect a webcam, or add GenICam", setup.genicam_problem.remedy)
         case CellStep.CAMERA if setup.camera is None:
             return Action("", "Connect a camera", "Check its power, cable and network.")
         case CellStep.CAMERA:

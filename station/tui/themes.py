@@ -12,7 +12,10 @@ from textual.app import App
 from textual.binding import Binding
 from textual.color import Color
 from textual.filter import LineFilter
+from textual.notifications import SeverityLevel
 from textual.theme import BUILTIN_THEMES, Theme
+
+from station.tui.words import with_short_words
 
 R = TypeVar("R")
 _COLOURS = {  # dark, light, the terminal's own 16 colours
@@ -116,8 +119,16 @@ def _colourless(style: Style) -> Style:
     return Style(bold=style.bold, dim=style.dim, reverse=chip or style.reverse, underline=style.underline)
 
 
+_BESIDE_A_TOAST = 8
+"""Cells of a screen's width that border, padding and margin of a message take, at least."""
+_TOAST_SHARE = 0.9
+"""Of the screen's width that a message may take: a path is read, and copied, as one line."""
+
+
 class ThemedApp(App[R]):
     """An app in the theme that its terminal or a person's environment asks for."""
+
+    CSS = f"Toast {{ width: auto; max-width: {_TOAST_SHARE:.0%}; }}"
 
     def __init__(self) -> None:
         super().__init__()
@@ -128,6 +139,20 @@ class ThemedApp(App[R]):
             self.unregister_theme(name)
         if self.no_color:
             self._filters.append(NoColour())
+
+    def notify(
+        self,
+        message: str,
+        *,
+        title: str = "",
+        severity: SeverityLevel = "information",
+        timeout: float | None = None,
+        markup: bool = True,
+    ) -> None:
+        """Show a message. A path that is longer than the message is wide is shortened in its middle."""
+        cells = int(_TOAST_SHARE * self.size.width) - _BESIDE_A_TOAST
+        shown = with_short_words(message, cells)
+        super().notify(shown, title=title, severity=severity, timeout=timeout, markup=markup)
 
     def get_key_display(self, binding: Binding) -> str:
         """Write F5 as it is printed on the key."""

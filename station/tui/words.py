@@ -45,6 +45,19 @@ def shortened(text: str, cells: int, parts: bool = False) -> str:
     return whole if whole and parts else f"{whole or text[: cells - 1]}…"
 
 
+def with_short_words(text: str, cells: int) -> str:
+    """Shorten each word longer than `cells`, as a path, in its middle: both ends tell most."""
+    return " ".join(_middle_out(word, cells) for word in text.split(" "))
+
+
+def _middle_out(word: str, cells: int) -> str:
+    if len(word) <= cells:
+        return word
+    head = (cells - 1) // 2
+    tail = cells - 1 - head
+    return f"{word[:head]}…{word[-tail:]}"
+
+
 def sentence(text: str) -> str:
     """Write a reason of an error, which also stands within others' sentences, as one of its own."""
     return text[:1].upper() + text[1:] + "." * text[-1:].isalnum()

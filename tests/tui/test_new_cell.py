@@ -28,7 +28,7 @@ from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
 from station.tui.frame import StopBlock
 from station.tui.new_cell import NewCell
-from station.tui.new_cell_steps import about
+from station.tui.new_cell_steps import about, next_of
 from tests.codes import raises
 from tests.conftest import check_allow_list
 from tests.station.operate.guided_views import guided_joints
@@ -156,6 +156,26 @@ class GreyCamera(RealHardware):
         return Image(np.full((480, 640), 110, np.uint8), Stamps(), 0, 0)
 
     async def close(self) -> None: ...
+
+
+class NoLibrary(GreyCamera):
+    """No camera answers, and no GenICam camera could be opened."""
+
+    plugged = ()
+
+    async def genicam_problem(self) -> CameraError | None:
+        return CameraError("no-aravis", reason="No module named 'gi'")
+
+
+async def test_a_missing_library_is_named_before_anybody_looks_for_a_loose_cable(tmp_path: Path) -> None:
+    setup = CellSetup(NoLibrary(), tmp_path, tmp_path / "station.yaml")
+    await setup.look_for_cameras()
+    assert setup.genicam_problem is not None
+    said = next_of(setup, CellStep.CAMERA, "")
+    assert said.why == setup.genicam_problem.remedy
+    connected = CellSetup(GreyCamera(), tmp_path, tmp_path / "station.yaml")
+    await connected.look_for_cameras()
+    assert connected.genicam_problem is None
 
 
 async def test_an_arm_that_a_program_posts_needs_a_name_a_camera_and_a_board(tmp_path: Path) -> None:

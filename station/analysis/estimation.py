@@ -11,6 +11,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from calibrate.arms.classes import ArmClass, arm_class
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
@@ -26,6 +27,7 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.placed_point import PointPrediction
 from calibrate.handeye.pose_fit import PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.unlearned_arm import arm_part_m
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline.gates import ADVICE, STATION_ERROR_M, GateLimits
@@ -67,7 +69,7 @@ def running_estimate(
         return blank
     try:
         quick = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
-        error = quick_error(quick, config.board, not lens_is_known)
+        error = quick_error(quick, config.board, not lens_is_known, class_of(config, seen))
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return blank
     joints_known = all(view.joints_rad is not None for view in seen)
@@ -91,7 +93,7 @@ class QuickError:
     from_x_m: float
     """Part by X: what views lower."""
     floor_m: float
-    """Part by what the arm does differently each time: what no view lowers."""
+    """Part by the arm, its errors and what it does differently each time: what no view lowers."""
     with_more_views_m: float
     """What ten more views like these would leave of `error_m`."""
     distance_m: float
@@ -104,21 +106,50 @@ class QuickError:
         return self.floor_m > goal_m and self.with_more_views_m > (1.0 - WORTH_TEN_VIEWS) * self.error_m
 
 
-def quick_error(quick: QuickFit, board: BoardSpec, free_lens: bool) -> QuickError:
-    """Predict the error of a placed point by the quick fit, which models no errors of the arm: they are in
-    its noise. LinAlgError where X and Y put the board out of sight.
+def class_of(config: StationConfig, seen: Sequence[BoardView]) -> ArmClass:
+    """Look up the class of the cell's arm, as a solve of these views would."""
+    joints = seen[0].joints_rad if seen else None
+    return arm_class(config.robot.model, config.robot.arm_class, None if joints is None else len(joints))
+
+
+def quick_error(
+    quick: QuickFit, board: BoardSpec, free_lens: bool, of_class: ArmClass | None = None
+) -> QuickError:
+    """Predict the error of a placed point by the quick fit and the arm's class.
+
+    of_class: class of the arm; None: its links have no errors. LinAlgError where X and Y put the board out of
+    sight.
     """
     distance_m = median_distance_m(quick.views.camera_from_board)
     point = quick_point(quick, distance_m)
     information, prior = _quick_information(quick, board, free_lens)
-    error_m = predicted_error_m(information, prior, point)
-    from_x = error_m**2 - point.floor_m**2
+    known_m = predicted_error_m(information, prior, point)
+    more_m = with_more_views_m(information, prior, point, float(quick.fit.full.sum()))
+    arm_m = 0.0 if of_class is None else quick_arm_part_m(quick, board, free_lens, of_class, distance_m)
     return QuickError(
-        error_m=error_m,
-        from_x_m=float(np.sqrt(max(from_x, 0.0))),
-        floor_m=point.floor_m,
-        with_more_views_m=with_more_views_m(information, prior, point, float(quick.fit.full.sum())),
+        error_m=float(np.hypot(known_m, arm_m)),
+        from_x_m=float(np.sqrt(max(known_m**2 - point.floor_m**2, 0.0))),
+        floor_m=float(np.hypot(point.floor_m, arm_m)),
+        with_more_views_m=float(np.hypot(more_m, arm_m)),
         distance_m=distance_m,
+    )
+
+
+def quick_arm_part_m(
+    quick: QuickFit, board: BoardSpec, free_lens: bool, of_class: ArmClass, distance_m: float
+) -> float:
+    """Compute the part of a placed point's error by errors of the arm's links, metres (`unlearned_arm`)."""
+    return arm_part_m(
+        quick.views,
+        quick.X,
+        quick.Y,
+        board_points(board),
+        quick.noise,
+        quick.fit.full,
+        BoardTolerance.of(board),
+        not free_lens,
+        of_class,
+        distance_m,
     )
 
 

@@ -12,6 +12,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from calibrate.arms.classes import ArmClass
 from calibrate.views.view_set import BoardView
 from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount
@@ -44,12 +45,18 @@ class HandGuide:
     """One for each beginning: a session by hand, a cell's views.
 
     `latest`: the arm's newest state, RobotError where there is none. `stillness` is fed by its states.
+    `of_class`: class of the arm, for the error that the next view is to leave.
     """
 
     def __init__(
-        self, latest: Callable[[], object], stillness: StillnessMonitor, call: Call = in_thread
+        self,
+        latest: Callable[[], object],
+        stillness: StillnessMonitor,
+        of_class: ArmClass,
+        call: Call = in_thread,
     ) -> None:
         self._latest, self._stillness, self._call = latest, stillness, call
+        self._of_class = of_class
         self.way = Way("", False)
         """From the newest image to the wanted view."""
         self.take = False
@@ -133,7 +140,7 @@ class HandGuide:
             if self._known is not None:
                 self._given_up.clear()
             self._wanted = await self._call(
-                next_view, *cell, list(views), list(self._given_up), timeout_s=_CHOOSE_S
+                next_view, *cell, list(views), list(self._given_up), self._of_class, timeout_s=_CHOOSE_S
             )
             self._known = known
         return self._wanted

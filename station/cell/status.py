@@ -198,10 +198,10 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
     views: int = 0
     predicted_error_mm: float | None = None
-    """Placed-point error (1σ) at the working distance, by the noise that the images so far show. Solving adds
-    errors of the arm that are the same in every image."""
+    """Placed-point error (1σ) at the working distance, by the noise that the images so far show and by errors
+    of the arm's links as its class has them. Solving learns these from recorded joints."""
     floor_mm: float | None = None
-    """Part of it by what the arm does differently each time: no view lowers it."""
+    """Part of it by the arm, its errors and what it does differently each time: no view lowers it."""
     with_more_views_mm: float | None = None
     """What ten more views like these would leave of it."""
     working_distance_m: float | None = None

@@ -9,7 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.arms.chain import chain_of
+from calibrate.arms.classes import ARM_CLASSES
+from calibrate.arms.kinematics import MODELS
 from calibrate.boards.model import board_points
+from calibrate.handeye.arm import ArmPostures
+from calibrate.handeye.assumed_arm import link_sizes
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.placed_point import PointPrediction
 from calibrate.pipeline.gates import STATION_ERROR_M
@@ -97,6 +102,56 @@ def test_a_point_is_placed_as_well_as_is_stated(mount: Mount) -> None:
         ratios.append((e**2).sum(axis=1).mean() / stated.error_m**2)
         assert stated.error_m**2 == pytest.approx(stated.from_x_m**2 + stated.floor_m**2)
     assert 0.6 < np.sqrt(np.mean(ratios)) < 1.4
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize(
+    ("told", "most"), [("universal-robots", 1.1), ("industrial-six", 1.2), ("servo", 1.6)]
+)
+def test_an_arm_that_errs_by_its_links_is_stated_as_it_places_points(
+    told: str, most: float, mount: Mount
+) -> None:
+    """Smooth errors of links agree from view to view better than points are placed by them."""
+    truth, config, _ = cell(mount)
+    joints = np.array([place.joints_rad for place in quick_plan(config, truth, seed=3, count=25).poses])
+    model = MODELS[truth.robot_model]
+    of_class = ARM_CLASSES[told]
+    sizes = link_sizes(ArmPostures(chain_of(model), joints, True, model), of_class)
+    chain = chain_of(model)
+    sigma = 1e-3 * np.tile(np.repeat([sizes.shift_mm, sizes.turn_mrad], 3), len(chain.link_errors) // 6)
+    points = board_points(truth.board)
+    controller = chain.forward(joints)
+    with_class = []
+    without = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        real = chain.with_errors(sigma * rng.normal(size=len(sigma))).forward(joints)
+        views = [
+            BoardView(
+                index,
+                f"p{index}",
+                controller[index],
+                Corners(points, corners_seen(truth, board_seen(truth, real[index]), rng)),
+                joints[index],
+            )
+            for index in range(15)
+        ]
+        quick = solve_quickly(mount, truth.camera, True, truth.board, views)
+        stated = quick_error(quick, truth.board, False, of_class)
+        point = np.array([[0.0, 0.0, stated.distance_m]])
+        missed = []
+        for a, b in zip(*np.nonzero(~np.eye(15, dtype=bool)), strict=True):
+            seen = quick.X
+            stands = np.array(truth.camera_mount)
+            if mount == "eye-in-hand":
+                seen, stands = controller[a] @ seen, real[a] @ stands
+            ends = transform_points(real[b] @ inverse(controller[b]) @ seen, point)
+            missed.append(ends - transform_points(stands, point))
+        square = float((np.array(missed) ** 2).sum(axis=-1).mean())
+        with_class.append(square / stated.error_m**2)
+        without.append(square / quick_error(quick, truth.board, False).error_m ** 2)
+    assert 0.5 < np.sqrt(np.mean(with_class)) < most
+    assert np.sqrt(np.mean(without)) > 1.1 * np.sqrt(np.mean(with_class))
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

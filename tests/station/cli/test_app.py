@@ -132,7 +132,11 @@ def test_a_session_with_loss_names_what_is_missing_and_ends_with_3(
 async def test_a_paused_session_is_finished_with_loss_only_where_nobody_attends(headless: bool) -> None:
     link, paused = FakeLink(), in_session(idle(StationState.PAUSED), captured=1)
     link.show(paused)
-    await session.Attended(Path(), link, True, headless, "", True).watch(True, paused)
+
+    async def again() -> bool:
+        raise AssertionError("it had begun")
+
+    await session.Attended(Path(), link, True, headless, "", True).watch(True, paused, again)
     assert link.verbs == ["finish"] * headless
 
 

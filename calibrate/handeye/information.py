@@ -93,7 +93,10 @@ def prior_information(
     `arm_error_mm`: 1σ, mm and mrad, of errors of the arm's links, for each (q,) or one for all of six joints;
     0: none are modelled.
     """
-    errors = np.zeros(np.size(arm_error_mm) if np.ndim(arm_error_mm) else _LINK_ERRORS if arm_error_mm else 0)
+    if np.ndim(arm_error_mm):
+        errors = np.zeros(np.size(arm_error_mm))
+    else:
+        errors = np.zeros(_LINK_ERRORS if arm_error_mm else 0)
     state = CellState(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), errors)
     lens = LensPrior.given(camera) if lens_known else LensPrior.unknown(camera)
     N = Priors(lens, board).linearise(state, arm_error_mm).N

@@ -93,7 +93,8 @@ class PlacedPoint:
         if in_hand and tool_m is None:
             pairs = _Pairs.of_recorded(len(seen))
         else:
-            pairs = _Pairs.within(tool_m or np.inf, seen, postures.flange[:, :3, 3])
+            farthest_m = np.inf if tool_m is None else tool_m
+            pairs = _Pairs.within(farthest_m, seen, postures.flange[:, :3, 3])
         make = _in_hand if in_hand else _fixed
         return make(postures, pairs, seen, known, installed, p)
 

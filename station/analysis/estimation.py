@@ -37,8 +37,8 @@ from recordings.files import MAIN_CAMERA
 from recordings.geometry import Array
 from recordings.images import viewable
 from recordings.reader import open_recording
-from recordings.schema.messages import BoardSpec, CameraModel, Mount
-from station.cell.config import StationConfig, matrix4
+from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotIdentity
+from station.cell.config import RobotConfig, StationConfig, matrix4
 from station.cell.layout import board_place
 from station.cell.status import WORTH_TEN_VIEWS, EstimateStatus
 from station.plan.visibility import count_in_parts
@@ -69,7 +69,7 @@ def running_estimate(
         return blank
     try:
         quick = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
-        error = quick_error(quick, config.board, not lens_is_known, class_of(config, seen))
+        error = quick_error(quick, config.board, not lens_is_known, class_of(config.robot, seen))
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return blank
     joints_known = all(view.joints_rad is not None for view in seen)
@@ -106,10 +106,10 @@ class QuickError:
         return self.floor_m > goal_m and self.with_more_views_m > (1.0 - WORTH_TEN_VIEWS) * self.error_m
 
 
-def class_of(config: StationConfig, seen: Sequence[BoardView]) -> ArmClass:
-    """Look up the class of the cell's arm, as a solve of these views would."""
+def class_of(robot: RobotConfig | RobotIdentity, seen: Sequence[BoardView]) -> ArmClass:
+    """Look up the class of an arm, as a solve of these views would."""
     joints = seen[0].joints_rad if seen else None
-    return arm_class(config.robot.model, config.robot.arm_class, None if joints is None else len(joints))
+    return arm_class(robot.model, robot.arm_class, None if joints is None else len(joints))
 
 
 def quick_error(

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.arms.classes import ArmClass
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.handeye.information import (
@@ -27,8 +26,8 @@ from calibrate.views.corners import Corners
 from calibrate.views.projection import project
 from calibrate.views.view_set import BoardView, ViewSet, implied_flange
 from recordings.geometry import Array, pose, rotation_angle, rotation_exp, rotation_log, transform_points
-from recordings.schema.messages import BoardSpec, CameraModel, Mount
-from station.analysis.estimation import as_views, quick_arm_part_m, quick_point
+from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotIdentity
+from station.analysis.estimation import as_views, class_of, quick_arm_part_m, quick_point
 from station.analysis.found_cell import FoundCell, find_cell
 from station.plan.choose import camera_objective
 from station.plan.visibility import ViewRange, camera_views, distances_that_fill, outline, roll_of, visible
@@ -110,12 +109,12 @@ def next_view(
     lens_known: bool,
     seen: Sequence[BoardView],
     given_up: Sequence[Array] = (),
-    of_class: ArmClass | None = None,
+    robot: RobotIdentity | None = None,
 ) -> NextView:
     """Choose the most useful next view, in some 0.3 s. `camera`: without a matrix its lens is unknown.
 
     `given_up`: wanted views (4, 4) to which the person did not get; what is near them is not asked for.
-    `of_class`: class of the arm, whose own errors are in the predicted error; None: it has none.
+    `robot`: the arm, by whose class its own errors are in the predicted error; None: it has none.
     """
     points, found = board_points(board), find_cell(mount, board, camera, lens_known, seen)
     if found is None:  # as if the flange were the camera: how much is learned depends on its turns
@@ -137,8 +136,8 @@ def next_view(
     if found is not None:
         point = quick_point(found, distance_m)
         after_m = predicted_error_m(known + gains[best], objective.prior, point)
-        if of_class is not None:
-            arm_m = quick_arm_part_m(found, board, not lens_known, of_class, distance_m)
+        if robot is not None:
+            arm_m = quick_arm_part_m(found, board, not lens_known, class_of(robot, seen), distance_m)
             after_m = float(np.hypot(after_m, arm_m))
     return NextView(mount, board, lens, at, pool[best], found, after_m)
 

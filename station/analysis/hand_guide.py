@@ -12,10 +12,9 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from calibrate.arms.classes import ArmClass
 from calibrate.views.view_set import BoardView
 from recordings.geometry import Array
-from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount
+from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity
 from station.analysis.estimation import FEWEST_FOR_LENS
 from station.analysis.guidance import NextView, Way, motion_px, next_view, way_to
 from station.analysis.worker import Sighting
@@ -45,18 +44,18 @@ class HandGuide:
     """One for each beginning: a session by hand, a cell's views.
 
     `latest`: the arm's newest state, RobotError where there is none. `stillness` is fed by its states.
-    `of_class`: class of the arm, for the error that the next view is to leave.
+    `robot`: the arm, for the error that the next view is to leave.
     """
 
     def __init__(
         self,
         latest: Callable[[], object],
         stillness: StillnessMonitor,
-        of_class: ArmClass,
+        robot: RobotIdentity,
         call: Call = in_thread,
     ) -> None:
         self._latest, self._stillness, self._call = latest, stillness, call
-        self._of_class = of_class
+        self._robot = robot
         self.way = Way("", False)
         """From the newest image to the wanted view."""
         self.take = False
@@ -140,7 +139,7 @@ class HandGuide:
             if self._known is not None:
                 self._given_up.clear()
             self._wanted = await self._call(
-                next_view, *cell, list(views), list(self._given_up), self._of_class, timeout_s=_CHOOSE_S
+                next_view, *cell, list(views), list(self._given_up), self._robot, timeout_s=_CHOOSE_S
             )
             self._known = known
         return self._wanted

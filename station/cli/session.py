@@ -220,7 +220,8 @@ def session_progress(console: Console, quiet: bool, before: StationStatus) -> It
 
         def show(status: StationStatus) -> None:
             nonlocal told
-            session, events = status.finished, status.events
+            session = status.finished
+            events = status.events
             where = f"pose {session.current + 1} " if session.current is not None else ""
             bar(session.captured, len(session.poses), f"{where}{status.state.value}")
             new = events[events.index(told[0]) + 1 :] if told and told[0] in events else events

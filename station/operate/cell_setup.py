@@ -8,7 +8,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.arms.classes import arm_class
 from calibrate.boards.corners import to_grey
 from calibrate.boards.grids import seen_size
 from calibrate.views.view_set import BoardView
@@ -156,8 +155,7 @@ class CellSetup:
         if step is not CellStep.VIEWS or draft.mount is None or self.arm is None:
             return False
         if self.guide is None:
-            of_class = arm_class(self.arm.identity.model)
-            self.guide = HandGuide(self.arm.state, self._stillness, of_class)
+            self.guide = HandGuide(self.arm.state, self._stillness, self.arm.identity)
             self.arm.guided = True  # also: from the first view on no other TCP offset is taken
         arm, guide, blank = self.arm, self.guide, CameraModel(draft.width, draft.height)
         cell = (draft.mount, draft.board, blank, False)

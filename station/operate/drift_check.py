@@ -60,7 +60,8 @@ async def recorded(link: Client, before: str) -> SessionStatus | None:
     """
     seen = False
     async for status in link.statuses():
-        session, checked = status.session, status.checked
+        session = status.session
+        checked = status.checked
         if checked.name not in ("", before):
             if status.state is StationState.IDLE:
                 return checked

@@ -296,7 +296,8 @@ def predicted_errors_m(
     layout = layout_of(config)
     options = PlanOptions(criterion=plan.criterion or "A", free_intrinsics=not lens_known)
     joints = np.array([plan.poses[index].joints_rad for index in taken], dtype=float)
-    flange, free = forward(layout.geometry.model, joints), options.free_intrinsics
+    flange = forward(layout.geometry.model, joints)
+    free = options.free_intrinsics
     if options.criterion == "arm":
         gained = informations(layout, flange, joints, options.noise)
         objective = arm_objective(layout, free, joints)

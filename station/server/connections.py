@@ -189,7 +189,8 @@ class _Connection:
         self.peer = peer
         self.watching = False
         self._reader, self._writer, self._handler = reader, writer, handler
-        self._publish, self._news_line = publish, news_line
+        self._publish = publish
+        self._news_line = news_line
         self._tasks: set[asyncio.Task[None]] = set()
         self._works, self._read_s = False, 0.0
         """The arm works by this client; when it had last read everything since then."""

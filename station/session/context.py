@@ -229,9 +229,9 @@ class SessionContext:
         check = self.store.status.session
         if not check.check or self.recording is not None:
             return
-        before, self.before_check = self.before_check, Loaded()
         self.seen.clear()
-        self.stand_again(before)
+        self.stand_again(self.before_check)
+        self.before_check = Loaded()
         if check.recording:
             self.store.update(checked=check)
 

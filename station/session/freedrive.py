@@ -8,7 +8,6 @@ import logging
 import msgspec
 import numpy as np
 
-from calibrate.arms.classes import arm_class
 from recordings.errors import CodedError
 from recordings.schema.messages import NO_PICTURE, View
 from station.analysis.hand_guide import HandGuide
@@ -94,8 +93,8 @@ class FreedriveCapture:
         await look_back(context)
         Freedrive.require(store.state)  # STOP may have come in between
         context.requests.halt = False
-        of_class = arm_class(context.cell.config.robot.model, context.cell.config.robot.arm_class)
-        self.guide = HandGuide(context.cell.arm.state, context.stillness, of_class, context.workers.call)
+        arm = context.cell.arm
+        self.guide = HandGuide(arm.state, context.stillness, arm.identity, context.workers.call)
         # Enter the state at once: while the file is opened no motion is offered and no image begun.
         store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
         async with self._taking:

@@ -165,7 +165,8 @@ def _purpose_words(context: SessionContext, motion: Motion) -> str:
 
 def _skipped(motion: Motion) -> list[str]:
     """Say which poses of the plan a person skipped, perhaps in the session before."""
-    skipped, poses = motion.queue.skipped, len(motion.queue.statuses)
+    skipped = motion.queue.skipped
+    poses = len(motion.queue.statuses)
     if motion.stop_test is not None or not skipped:
         return []
     numbers = ", ".join(str(index + 1) for index in skipped)

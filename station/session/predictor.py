@@ -44,7 +44,8 @@ class Predictor:
 
     async def _errors_m(self, queue: PoseQueue) -> dict[int, float]:
         """Return pose number → error after it. Empty where it is not known: the plan's own is not true."""
-        context, whole = self._context, queue.planned_errors_m
+        context = self._context
+        whole = queue.planned_errors_m
         if set(queue.predicted) >= set(whole):
             return whole
         taken = tuple(index for index in queue.predicted if index in whole)

@@ -94,7 +94,8 @@ class Previewer:
             return PreviewImage()
         low, high = SIDES
         width, height = min(max(width, low), high), min(max(height, low), high)
-        age_s, corners = self._age_s, np.zeros((0, 2))
+        age_s = self._age_s
+        corners = np.zeros((0, 2))
         if self._sighting is not None and age_s <= OLD_S:
             corners = self._sighting.detection.corners.pixels
         made = await asyncio.to_thread(preview_image, self._picture, corners, width, height, self._count)

@@ -11,7 +11,7 @@ from calibrate.boards.model import board_points
 from calibrate.views.corners import Corners
 from calibrate.views.view_set import BoardView, implied_flange
 from recordings.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
-from recordings.schema.messages import CameraModel, Mount
+from recordings.schema.messages import CameraModel, Mount, RobotIdentity
 from station.analysis.guidance import NextView, next_view, rim, way_to
 from station.cell.status import FEWEST_BY_HAND
 from station.simulation.cells import make_cell
@@ -46,6 +46,10 @@ def test_who_follows_it_from_nothing_finds_the_camera(mount: Mount) -> None:
     wanted = next_view(mount, BOARD, BLANK, False, views)
     assert wanted.found is not None and wanted.found.good
     assert wanted.after_m is not None and wanted.after_m < 0.001
+    typical = RobotIdentity(model=truth.robot_model)
+    worse = RobotIdentity(model=truth.robot_model, arm_class="servo")
+    by_arm = [next_view(mount, BOARD, BLANK, False, views, (), robot).after_m for robot in (typical, worse)]
+    assert wanted.after_m < by_arm[0] < by_arm[1], "the arm's own errors are in what the next view leaves"
     off = difference(wanted.found.X, X)
     assert np.linalg.norm(off[:3]) < 0.002 and np.linalg.norm(off[3:]) < 0.003
     assert not way_to(wanted, views[5]).new

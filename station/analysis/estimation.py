@@ -27,7 +27,7 @@ from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.placed_point import PointPrediction
 from calibrate.handeye.pose_fit import PoseFit, PoseViews, fit_poses, pose_views
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.unlearned_arm import arm_part_m
+from calibrate.handeye.unlearned_arm import UnlearnedArm
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline.gates import ADVICE, STATION_ERROR_M, GateLimits
@@ -138,19 +138,24 @@ def quick_error(
 def quick_arm_part_m(
     quick: QuickFit, board: BoardSpec, free_lens: bool, of_class: ArmClass, distance_m: float
 ) -> float:
-    """Compute the part of a placed point's error by errors of the arm's links, metres (`unlearned_arm`)."""
-    return arm_part_m(
-        quick.views,
+    """Compute the part of a placed point's error by errors of the arm's links, metres (`unlearned_arm`).
+
+    0 where no typical arm reaches all views. LinAlgError where X and Y put the board out of sight.
+    """
+    arm = UnlearnedArm.of(
+        quick.views.mount,
+        quick.views.camera,
+        quick.views.base_from_flange,
         quick.X,
         quick.Y,
         board_points(board),
         quick.noise,
-        quick.fit.full,
         BoardTolerance.of(board),
         not free_lens,
         of_class,
         distance_m,
     )
+    return 0.0 if arm is None else arm.part_m(quick.fit.full)
 
 
 def quick_point(quick: QuickFit, distance_m: float) -> PointPrediction:

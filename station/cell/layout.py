@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calibrate.arms.classes import ArmClass, arm_class
 from calibrate.arms.kinematics import MODELS, RobotModel, forward, with_near_axes
 from calibrate.boards.model import board_points
 from calibrate.views.projection import camera_matrix
@@ -59,6 +60,8 @@ class CellLayout:
     """1σ of X per axis: metres, radians."""
     y_sigma: tuple[float, float] = (0.0, 0.0)
     working_distance_m: float = 0.5
+    of_class: ArmClass | None = None
+    """The arm's class, by which its own error is looked up; None: its links have no errors."""
 
     def camera_from_board(self, base_from_flange: Array) -> Array:
         """Compute camera_from_board (..., 4, 4) for flange poses (..., 4, 4)."""
@@ -129,6 +132,7 @@ def layout_of(config: StationConfig) -> CellLayout:
         x_sigma=(mount_guess.sigma_m, mount_guess.sigma_rad),
         y_sigma=(place_guess.sigma_m, place_guess.sigma_rad),
         working_distance_m=config.working_distance_m,
+        of_class=arm_class(config.robot.model, config.robot.arm_class),
     )
 
 

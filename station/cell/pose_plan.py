@@ -57,7 +57,8 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     working_distance_m: float | None = None
     """Median distance of camera and board, for which the poses state a placed-point error."""
     floor_m: float | None = None
-    """Part of these errors by a usual arm's noise: no pose lowers it. None: older plans."""
+    """Part of these errors by the arm: its noise, and what all poses leave of its links' errors. No further
+    pose lowers it. None: older plans."""
 
     def predicted_error_m(self, index: int) -> float | None:
         """Placed-point error with the poses up to this one; None: not known, or of X alone (older plans)."""

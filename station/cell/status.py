@@ -250,7 +250,7 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     working_distance_m: float | None = None
     """Distance of the point whose placed-point error the plan states."""
     floor_mm: float | None = None
-    """Part of the plan's placed-point errors by a usual arm's noise: no view lowers it."""
+    """Part of the plan's placed-point errors by the arm: no view more lowers it."""
     current: int | None = None
     """Number of the pose under way, or of the last one."""
     captured: int = 0

@@ -137,7 +137,7 @@ class PlanJson(msgspec.Struct, frozen=True):
     predicted_error_mm: float | None
     """Placed-point error (1σ) after the last pose."""
     floor_mm: float | None
-    """Part of it by a usual arm's noise: no pose lowers it."""
+    """Part of it by the arm, its errors and what it does differently each time: no pose lowers it."""
     note: str
     problems: list[Problem]
 

@@ -15,6 +15,8 @@ from calibrate.handeye.information import USUAL_NOISE, predicted_error_m
 from calibrate.handeye.metrics import median_distance_m
 from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.placed_point import PointPrediction
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.unlearned_arm import UnlearnedArm
 from recordings.geometry import Array
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
@@ -251,10 +253,10 @@ def _describe(
 ) -> Plan:
     model = layout.geometry.model
     distance_m = median_distance_m(layout.camera_from_board(forward(model, joints)))
-    point = _point(layout, options, joints, distance_m)
+    predicted = _predict(layout, options, joints, distance_m, gained, objective)
     poses = tuple(
         planned_pose(layout, number, q, error_m)
-        for number, (q, error_m) in enumerate(zip(joints, _errors_m(gained, objective, point), strict=True))
+        for number, (q, error_m) in enumerate(zip(joints, predicted.errors_m, strict=True))
     )
     limits = layout.geometry.limits
     return Plan(
@@ -266,21 +268,65 @@ def _describe(
         seed=options.seed,
         criterion=options.criterion,
         working_distance_m=round(distance_m, 4),
-        floor_m=round(point.floor_m, 9),
+        floor_m=round(predicted.floor_m, 9),
     )
 
 
-def _point(layout: CellLayout, options: PlanOptions, joints: Array, distance_m: float) -> PointPrediction:
-    """Predict for a point so far from the camera, at postures (n, 6)."""
+@dataclass(frozen=True)
+class _Predicted:
+    """The error of a placed point, metres."""
+
+    errors_m: list[float]
+    """After each of the poses."""
+    floor_m: float
+    """Part of the last one by the arm: no pose more lowers it."""
+
+
+def _predict(
+    layout: CellLayout,
+    options: PlanOptions,
+    joints: Array,
+    distance_m: float,
+    gained: Array,
+    objective: Objective,
+) -> _Predicted:
+    """Predict for a point so far from the camera, at postures (n, 6), by what each gains (n, p, p)."""
     model = layout.geometry.model
-    by_links = chain_of(model).by_links(joints) if options.criterion == "arm" else None
+    learns_arm = options.criterion == "arm"
+    by_links = chain_of(model).by_links(joints) if learns_arm else None
     flange = forward(model, joints)
-    return PointPrediction.of(layout.mount, layout.X, flange, distance_m, options.noise, by_links)
+    point = PointPrediction.of(layout.mount, layout.X, flange, distance_m, options.noise, by_links)
+    known_m = np.array([predicted_error_m(known, objective.prior, point) for known in gained.cumsum(axis=0)])
+    # What a plan for the arm gains holds the errors of its links already.
+    arm_m = np.zeros(len(joints)) if learns_arm else _arm_parts_m(layout, options, flange, distance_m)
+    return _Predicted(np.hypot(known_m, arm_m).tolist(), float(np.hypot(point.floor_m, arm_m[-1])))
 
 
-def _errors_m(gained: Array, objective: Objective, point: PointPrediction) -> list[float]:
-    """Predict the placed-point error after each view, by what each of them gains (n, p, p)."""
-    return [predicted_error_m(known, objective.prior, point) for known in gained.cumsum(axis=0)]
+def _arm_parts_m(layout: CellLayout, options: PlanOptions, flange: Array, distance_m: float) -> Array:
+    """Compute the part of the error by the arm's own errors after each of the flanges (n, 4, 4): (n,) metres.
+
+    As while capturing (`UnlearnedArm`); none where no typical arm reaches all flanges.
+    """
+    count = len(flange)
+    if layout.of_class is None:
+        return np.zeros(count)
+    arm = UnlearnedArm.of(
+        layout.mount,
+        layout.camera,
+        flange,
+        layout.X,
+        layout.Y,
+        board_points(layout.board),
+        options.noise,
+        BoardTolerance.of(layout.board),
+        not options.free_intrinsics,
+        layout.of_class,
+        distance_m,
+    )
+    if arm is None:
+        return np.zeros(count)
+    taken = np.tri(count)
+    return np.array([arm.part_m(weights) for weights in taken])
 
 
 def predicted_errors_m(
@@ -305,4 +351,4 @@ def predicted_errors_m(
         gained = informations(layout, flange, None, options.noise)
         objective = camera_objective(layout.camera, layout.board, layout.working_distance_m, free)
     distance_m = plan.working_distance_m or median_distance_m(layout.camera_from_board(flange))
-    return _errors_m(gained, objective, _point(layout, options, joints, distance_m))
+    return _predict(layout, options, joints, distance_m, gained, objective).errors_m

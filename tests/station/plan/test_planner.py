@@ -15,12 +15,16 @@ from calibrate.arms.kinematics import MODELS, forward, inverse_many
 from calibrate.boards.model import board_points
 from calibrate.handeye.information import covariance_of
 from calibrate.handeye.metrics import point_error_m
+from calibrate.views.corners import Corners
+from calibrate.views.view_set import BoardView
 from recordings.geometry import (
     matrix_from_quaternion,
+    perturb,
     quaternion_from_matrix,
     rotation_angle,
     rotation_exp,
 )
+from station.analysis.estimation import running_estimate
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.layout import cell_geometry, layout_of
 from station.cell.limits import check_plan
@@ -30,7 +34,7 @@ from station.plan.planner import PlanOptions, make_plan, plan_layout, predicted_
 from station.plan.visibility import ViewRange, lens_radius, view_range, visible
 from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
-from tests.station.true_camera import board_seen
+from tests.station.true_camera import board_seen, corners_seen
 
 CELLS = [
     ("paper", "eye-in-hand", 0),
@@ -93,7 +97,42 @@ def test_poses_are_varied_and_say_why_they_are_there():
     assert all("mm" in pose.why and "tilt" in pose.why for pose in plan.poses)
     sigmas = [pose.predicted_sigma_m for pose in plan.poses]
     assert all(b <= a * (1 + 1e-9) for a, b in pairwise(sigmas))
-    assert 0.0001 < plan.floor_m < sigmas[-1] < 0.0007
+    assert 0.0001 < plan.floor_m < sigmas[-1] < 0.001
+
+
+def test_the_error_is_larger_with_an_arm_of_a_class_that_misses_by_more():
+    truth, config = cell()
+
+    def end(arm_class):
+        robot = msgspec.structs.replace(config.robot, arm_class=arm_class)
+        plan = plan_layout(
+            layout_of(msgspec.structs.replace(config, robot=robot)), FEW, truth.start_joints_rad
+        )
+        return plan.poses[-1].predicted_sigma_m, plan.floor_m
+
+    ur_m, ur_floor_m = end("universal-robots")
+    servo_m, servo_floor_m = end("servo")
+    assert end("")[0] == ur_m, "the model's name tells the class"
+    assert servo_m > 3 * ur_m and servo_floor_m > 3 * ur_floor_m
+    assert servo_floor_m > 0.7 * servo_m, "hardly any of it is lowered by poses"
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_capturing_the_plan_shows_the_error_that_it_predicts(mount):
+    """Corners twice as good as assumed, and an arm as its class has it: capture shows a little less."""
+    truth, config = cell(mount=mount, seed=3)
+    plan = planned(mount=mount, seed=3)
+    rng = np.random.default_rng(3)
+    seen = []
+    for index, pose in enumerate(plan.poses):
+        told = np.array(pose.base_from_flange)
+        there = perturb(told, rng.normal(size=6) * np.repeat([1e-4, 1.7e-4], 3))
+        pixels = corners_seen(truth, board_seen(truth, there), rng)
+        corners = Corners(board_points(truth.board), pixels)
+        seen.append(BoardView(index, pose.name, told, corners, np.array(pose.joints_rad)))
+    shown = running_estimate(config, config.camera.model, False, seen)
+    assert shown.predicted_error_mm == pytest.approx(1e3 * plan.poses[-1].predicted_sigma_m, rel=0.35)
+    assert shown.floor_mm == pytest.approx(1e3 * plan.floor_m, rel=0.35)
 
 
 @pytest.mark.parametrize("criterion", ["A", "arm"])

@@ -349,6 +349,18 @@ class PeerResult:
     """False where the method's raw matrix is not a rigid transform."""
 
 
+class MovedPoint(msgspec.Struct, frozen=True):
+    """A point on the camera's axis, as a shift of the camera moves what is measured of it."""
+
+    at_m: float
+    """Distance of the point from the camera."""
+    moved_mm: float
+    sigma_mm: float
+    """What `moved_mm` would be (root mean square) if nothing had moved."""
+    placed_mm: float | None
+    """Error of a placed point as the calibration states it (`PointError.error_mm`); None: it states none."""
+
+
 class DriftFigures(msgspec.Struct, frozen=True, eq=False):
     """Result of a drift check, as `calibrate drift-check --json` prints it, too."""
 

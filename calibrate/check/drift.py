@@ -21,12 +21,13 @@ from calibrate.files.calibration import Calibration
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.linear import Linear
+from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.mixture import SHARE_COUNTS
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.posterior import KnownCell
 from calibrate.handeye.priors import BoardTolerance, KnownBefore
 from calibrate.handeye.uncertainty import inverse_of
-from calibrate.results import SHAPE, DriftFigures
+from calibrate.results import SHAPE, DriftFigures, MovedPoint
 from calibrate.views.projection import intrinsics_names
 from calibrate.views.view_set import ViewSet, extent_of, require_no_copies
 from recordings.geometry import Array
@@ -163,6 +164,24 @@ def check_drift(views: ViewSet, known: KnownCell) -> DriftCheck:
         elsewhere=elsewhere,
         evidence=evidence,
     )
+
+
+def moved_point(check: DriftFigures, calibration: Calibration) -> MovedPoint | None:
+    """Compute how far the shift moves a point at the distance for which the calibration states its error.
+
+    The error of a point as the arm will place it tells whether that matters. None where the calibration
+    states no distance.
+    """
+    quality = calibration.quality
+    point = quality.point
+    at_m = quality.working_distance_m if point is None else point.at_m
+    if at_m is None:
+        return None
+    X = calibration.transform.matrix
+    lever = X[:3, :3] @ np.array([0.0, 0.0, at_m])
+    moved_m = float(np.linalg.norm(check.shift[:3] + np.cross(check.shift[3:], lever)))
+    sigma_m = point_error_m(X, check.covariance, at_m)
+    return MovedPoint(at_m, 1e3 * moved_m, 1e3 * sigma_m, None if point is None else point.error_mm)
 
 
 def limit(nu: float, false_alarm: float = FALSE_ALARM) -> float:

@@ -17,6 +17,7 @@ from calibrate.results import (
     DriftFigures,
     Gate,
     HoldoutScore,
+    MovedPoint,
     PeerResult,
     Remark,
     Views,
@@ -84,3 +85,5 @@ class DriftCheckJson(DriftFigures, frozen=True, kw_only=True, eq=False):
     own_views: bool
     trend: str
     validity: Validity | None
+    point: MovedPoint | None
+    """How far the shift moves a point; None where the calibration states no distance."""

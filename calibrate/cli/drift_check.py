@@ -11,7 +11,14 @@ from typing import Annotated
 import msgspec
 import typer
 
-from calibrate.check.drift import FEWEST_FOR_DRIFT_CHECK, POWER, DriftCheck, check_drift, known_cell
+from calibrate.check.drift import (
+    FEWEST_FOR_DRIFT_CHECK,
+    POWER,
+    DriftCheck,
+    check_drift,
+    known_cell,
+    moved_point,
+)
 from calibrate.check.history import Trend, advice_on_failure, append_check, read_checks
 from calibrate.check.production import MOST_PICTURES, check_production
 from calibrate.check.same_cell import OtherCellError, require_same_cell
@@ -114,7 +121,12 @@ def drift_check(
         unnoted = problem  # what a full disk cannot keep is told all the same
     proves_nothing = own and result.passed
     if as_json:
-        said = {"passed": result.passed and not own, "own_views": own, "validity": validity}
+        said = {
+            "passed": result.passed and not own,
+            "own_views": own,
+            "validity": validity,
+            "point": moved_point(result, calibration),
+        }
         told = msgspec.structs.asdict(result) | said | {"trend": "" if trend is None else trend.text}
         print_json(DriftCheckJson(**{name: told[name] for name in DriftCheckJson.__struct_fields__}))
     elif proves_nothing:
@@ -215,7 +227,8 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
     if not result.passed:
         text = (
             f"FAIL: camera shift {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° "
-            f"(p = {result.p_value:.1e}). {advice_on_failure(result.p_value)}"
+            f"(p = {result.p_value:.1e}).{_moved_text(result, calibration)} "
+            f"{advice_on_failure(result.p_value)}"
         )
     else:
         verdict = "PASS" if result.power >= POWER else "PASS, low sensitivity"
@@ -230,6 +243,17 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
     if result.disagreement > MOST_DISAGREEMENT:
         text += f" Noise {result.disagreement:.1f}× higher than at calibration. Check board and robot."
     return text
+
+
+def _moved_text(result: DriftCheck, calibration: Calibration) -> str:
+    """Say by how much the shift moves a point, beside what was stated of it; empty where nothing was."""
+    point = moved_point(result, calibration)
+    if point is None:
+        return ""
+    moved = f" A point {point.at_m:.2f} m from the camera moved by {point.moved_mm:.2f} mm"
+    if point.placed_mm is None:
+        return f"{moved}."
+    return f"{moved}; it was to be placed to ± {point.placed_mm:.3g} mm (1σ)."
 
 
 def production_text(result: DriftCheck, pictures: int) -> str:

@@ -113,20 +113,28 @@ class FrameNames:
 def comment(
     calibration: Calibration, frames: FrameNames, corrected: bool = False, attachable: bool = False
 ) -> str:
-    """Make the comment on the origin of an export, with a warning for a calibration of no real cell.
+    """Make the comment on the origin of an export: a warning for one of no real cell, and how right it is.
 
+    corrected: the export places the camera for the corrected arm.
     attachable: also how these frames and those of a camera's driver become one tree.
     Always one line: a line break in a name must not become a line of a launch file or a script.
     """
     stamp = SOURCE_STAMPS[calibration.source]
     origin = f"{calibration.provenance.session}, solved {calibration.created}"
+    point = calibration.quality.point
+    placed_mm = None if point is None else point.corrected_mm if corrected else point.error_mm
+    error = ""
+    if point is not None and placed_mm is not None:  # in ASCII, as not every reader takes more
+        error = f"Placed-point error at {1000 * point.at_m:.0f} mm: {placed_mm:.3g} mm (1 sigma)"
     held = "" if frames.validity is None else validity_text(frames.validity)
     two = ("the corrected arm", "the arm as it is")[:: 1 if corrected else -1]
     offered = calibration.arm_table is not None and calibration.arm_table.offered
     arm = f"Camera pose for {two[0]}, not for {two[1]}" if offered else ""
     tree = "To place a camera driver's own frames: options attach and driver-tf of calibrate export"
     how = tree if attachable and not frames.attach else ""
-    return " ".join(". ".join(part.rstrip(".") for part in (stamp, origin, arm, held, how) if part).split())
+    return " ".join(
+        ". ".join(part.rstrip(".") for part in (stamp, origin, error, arm, held, how) if part).split()
+    )
 
 
 def commented_yaml(calibration: Calibration, frames: FrameNames, plain: dict[str, Any], **layout: Any) -> str:

@@ -13,7 +13,7 @@ import pytest
 from scipy import stats
 
 from calibrate.boards.model import board_points
-from calibrate.check.drift import POWER, DriftCheck, check_drift, known_cell, powers
+from calibrate.check.drift import POWER, DriftCheck, check_drift, known_cell, moved_point, powers
 from calibrate.check.history import CheckEntry, append_check, read_checks
 from calibrate.check.trend import entry_of, find_trend
 from calibrate.cli.drift_check import check_text
@@ -211,6 +211,23 @@ def test_the_shift_is_named_and_the_stated_power_is_a_lower_bound() -> None:
     moved = checks(12, 0.5e-3, 0, 6)
     stated = np.mean([c.power_translation for c in moved])
     assert 0.1 < stated <= np.mean([not c.passed for c in moved]) + 0.05
+
+
+def test_it_says_how_far_a_point_moved(solved_real: SolvedRecording) -> None:
+    """By a shift alone, by a turn alone, and by a turn about the point itself."""
+    calibration = solved_real.calibration
+    X = calibration.transform.matrix
+    at_m = moved_point(quiet_check(), calibration).at_m
+    aside, axis = X[:3, 0], X[:3, 2]
+    shift = np.array([*(1e-3 * aside), 0.0, 0.0, 0.0])
+    turn = np.array([0.0, 0.0, 0.0, *(2e-3 * aside)])
+    about_point = np.array([*np.cross(2e-3 * aside, -at_m * axis), *(2e-3 * aside)])
+    moved = [
+        moved_point(msgspec.structs.replace(quiet_check(), shift=by), calibration)
+        for by in (shift, turn, about_point)
+    ]
+    assert [point.moved_mm for point in moved] == pytest.approx([1.0, 2.0 * at_m, 0.0], abs=1e-6)
+    assert moved[0].placed_mm == calibration.quality.point.error_mm
 
 
 def test_it_says_how_many_views_would_do() -> None:

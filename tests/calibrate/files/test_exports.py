@@ -25,6 +25,7 @@ from calibrate.files.validity import Validity, ValidityReason, ValidityState, un
 from calibrate.handeye.arm_table import CorrectedArm, FramePose
 from calibrate.pipeline.job import SolvedRecording
 from calibrate.pipeline.recorded_views import arm_of_ros
+from calibrate.results import PointError
 from recordings.geometry import Array, FrameMismatchError, Transform, inverse, pose, rotation_exp
 from recordings.schema.messages import RobotIdentity
 from tests.codes import raises
@@ -207,6 +208,15 @@ def test_frame_names_of_any_kind_stay_names(calibration: Calibration, tmp_path: 
     compile(text, "cell.launch.py", "exec")
     assert repr(odd.camera) in text
     assert re.search(r'name="[A-Za-z]\w*"', text, re.ASCII)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_it_says_how_right_a_point_is_placed(calibration: Calibration, name: str) -> None:
+    point = PointError(0.4567, 0.487, 0.9, 0.5, 0.3, 0.3, 0.1, 0.3, 0.45, "learned", corrected_mm=0.1234)
+    quality = msgspec.structs.replace(calibration.quality, point=point)
+    text = export(msgspec.structs.replace(calibration, quality=quality), name)
+    stated, other = ("0.457 mm", "0.123 mm")[:: -1 if name == "ur-kinematics" else 1]
+    assert stated in text and "487 mm" in text and other not in text
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -25,10 +25,11 @@ COMMANDS = {
     ),
     "export": LazyCommand(
         "calibrate.cli.installed:export",
-        "Write a calibration in another program's format.",
+        "Write a calibration in another program's format, or in a pendant's numbers.",
         (
             "calibrate export --to ros-launch -o camera.launch.py  # of what is installed",
             "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
+            "calibrate export --as kuka-abc  # or ur-pendant, fanuc-xyzwpr, abb-quaternion …",
         ),
     ),
     "install": LazyCommand(

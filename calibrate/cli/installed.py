@@ -59,8 +59,17 @@ def show(
 
 
 def export(
-    to: Annotated[FormatName, typer.Option("--to", help=_FORMATS_HELP)],
     file: Named = None,
+    to: Annotated[FormatName | None, typer.Option("--to", help=_FORMATS_HELP)] = None,
+    numbers: Annotated[
+        str,
+        typer.Option(
+            "--as",
+            metavar="CONVENTION",
+            help="The camera's place in a pendant's numbers, to paste: ur-pendant, ur-rotvec (URScript), "
+            "kuka-abc, fanuc-xyzwpr, abb-quaternion, or any other that an import reads",
+        ),
+    ] = "",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Default: stdout")] = None,
     base: Annotated[
         str, typer.Option(help="Robot's base in the file; for ROS's base_link the pose is converted")
@@ -90,16 +99,22 @@ def export(
     ] = None,
     root: Root = None,
 ) -> None:
-    """Write a calibration in another program's format.
+    """Write a calibration in another program's format, or in a pendant's numbers.
 
     The installed one is refused while it is in doubt or withdrawn; unverified, file and stderr say so.
     """
+    if (to is None) == (not numbers):
+        why = "--to names a file's format, --as a pendant's numbers"
+        raise UsageError("options", why=why, advice="Give one of them.")
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
     fixed = fixed_frames(driver_tf or [])
     frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, attach, fixed)
     given = None if arm is None else read_bounded(arm)
-    content = exports.export(calibration, str(to.value), frames, given)
+    if to is None:
+        content = exports.export_numbers(calibration, numbers, frames, given)
+    else:
+        content = exports.export(calibration, str(to.value), frames, given)
     if validity is not None and validity.state is not ValidityState.VALID:
         err.print(f"Warning: the calibration is {validity_text(validity)}", style="yellow")
     if output is None:

@@ -13,6 +13,7 @@ from rich.text import Text
 from calibrate.arms.classes import ARM_CLASSES
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, Quality
+from calibrate.files.pendants import PENDANTS
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.results import BoardShape, PointError
@@ -143,6 +144,11 @@ def pose_text(calibration: Calibration) -> str:
     return f"{x:.3f}  {y:.3f}  {z:.3f} mm,  roll {roll:.4f}°  pitch {pitch:.4f}°  yaw {yaw:.4f}°"
 
 
+def pendant_texts(calibration: Calibration) -> dict[str, str]:
+    """Write the orientation as each maker's pendant shows it; the position is that of `pose_text`."""
+    return {p.maker: p.orientation(calibration.transform.matrix) for p in PENDANTS}
+
+
 VALIDITY_STYLES = {
     ValidityState.VALID: "green",
     ValidityState.UNVERIFIED: "yellow",
@@ -179,6 +185,8 @@ def _result_table(calibration: Calibration) -> Table:
     position, rotation = pose_text(calibration).split(",", 1)
     table.add_row(f"{result.parent_frame}_from_{result.child_frame}", position)
     table.add_row("rotation", f"{rotation.strip()}  (fixed axes)")
+    for maker, text in pendant_texts(calibration).items():
+        table.add_row(f"  as {maker} shows it", text)
     table.add_row("1σ", f"{calibration.sigma.translation_mm:.3f} mm  {calibration.sigma.rotation_deg:.4f}°")
     for figure in figures(calibration).values():
         table.add_row(figure.label, f"{figure.value} {figure.about}")

@@ -10,13 +10,16 @@ import math
 import re
 from dataclasses import dataclass, replace
 from itertools import permutations
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError
-from recordings.importers.messages import Array
+from recordings.geometry import Array, inverse, quaternion_from_matrix, rotation_log
 from recordings.schema.messages import CameraAxes
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 OPTICAL_FROM_AXES: dict[CameraAxes, list[list[int]]] = {
     "optical": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -36,6 +39,8 @@ _SMALL_REACH_M = 0.15
 _UNIT_TOLERANCE = 0.01
 _TURN = 2 * math.pi + 0.01
 """Larger numbers are no angles in radians."""
+_LOCKED = 1e-14
+"""Nearer to gimbal lock, the split of the outer two angles is rounding and nothing else."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +67,30 @@ class Convention:
         }
         return "-".join([euler, *(sign for sign, holds in signs.items() if holds)])
 
+    @property
+    def about(self) -> str:
+        """Say for people what the numbers of one pose are, in their order and with their units."""
+        unit = next((unit for unit, unit_m in UNITS.items() if unit_m == self.unit_m), "m")
+        at = f"x y z in {unit}"
+        angle = "°" if self.degrees else "rad"
+        forms = {
+            "matrix": f"matrix row by row, its translation in {unit}",
+            "xyzw": "quaternion x y z w",
+            "wxyz": "quaternion w x y z",
+            "rotvec": f"rotation vector in {angle}",
+        }
+        axes = " ".join(self.rotation)
+        about = f"about the {'fixed' if self.rotation.islower() else 'moved'} axes {axes}"
+        turn = forms.get(self.rotation, f"angles in {angle} {about}")
+        parts = [turn, at] if self.rotation_first else [at, turn]
+        told = turn if self.rotation == "matrix" else ", ".join(parts)
+        return f"{told}, of the inverse" if self.inverse else told
+
     def poses(self, numbers: Array) -> Array:
         """Rigid transforms (n, 4, 4), metres, of (n, 12 or 16) for a matrix, (n, 7) or (n, 6)."""
+        # Loaded where numbers are read: programs that only write them do without.
+        from scipy.spatial.transform import Rotation
+
         n = len(numbers)
         T = np.broadcast_to(np.eye(4), (n, 4, 4)).copy()
         if self.rotation == "matrix":
@@ -77,12 +104,75 @@ class Convention:
         T[:, :3, 3] *= self.unit_m
         return np.asarray(np.linalg.inv(T) if self.inverse else T)
 
+    def numbers(self, poses: Array) -> Array:
+        """Write rigid transforms (n, 4, 4), metres, as numbers that `poses` reads: (n, 16), (n, 7) or (n, 6).
+
+        Quaternions have w ≥ 0, rotation vectors a length of at most π. Of angles the middle one is in a half
+        turn, the others in [-π, π]; at gimbal lock, where only the sum or the difference of the outer two is
+        known, the angle about the axis that is turned about first is 0.
+        """
+        T = inverse(poses) if self.inverse else np.array(poses, dtype=float)
+        T[:, :3, 3] /= self.unit_m
+        if self.rotation == "matrix":
+            return np.asarray(T.reshape(-1, 16))
+        turn, at = self._turn(T[:, :3, :3]), T[:, :3, 3]
+        return np.hstack([turn, at] if self.rotation_first else [at, turn])
+
+    def _turn(self, R: Array) -> Array:
+        """Write rotations (n, 3, 3) as (n, 4) or (n, 3)."""
+        if self.rotation == "xyzw":
+            return quaternion_from_matrix(R)
+        if self.rotation == "wxyz":
+            return np.roll(quaternion_from_matrix(R), 1, axis=1)
+        turn = rotation_log(R) if self.rotation == "rotvec" else euler_angles(self.rotation, R)
+        return np.asarray(np.degrees(turn) if self.degrees else turn)
+
     def _rotation(self, turn: Array) -> Rotation:
+        from scipy.spatial.transform import Rotation
+
         if self.rotation in ("xyzw", "wxyz"):
             return Rotation.from_quat(turn if self.rotation == "xyzw" else np.roll(turn, -1, axis=1))
         if self.rotation == "rotvec":
             return Rotation.from_rotvec(turn, degrees=self.degrees)
         return Rotation.from_euler(self.rotation, turn, degrees=self.degrees)
+
+
+def euler_angles(sequence: str, R: Array) -> Array:
+    """Convert rotations (n, 3, 3) to angles (n, 3), radians, of a sequence as in `Convention.rotation`.
+
+    By the quaternion (Bernardes and Viollet 2022): half the sum and half the difference of the outer angles
+    are each known where their own pair of components is. The angles together are accurate everywhere, also
+    near gimbal lock, where SciPy's lose half the digits.
+    """
+    fixed = sequence.lower() if sequence.islower() else sequence[::-1].lower()
+    i, j, k = ("xyz".index(axis) for axis in fixed)
+    is_proper = i == k
+    if is_proper:
+        k = 3 - i - j
+    sign = (i - j) * (j - k) * (k - i) // 2
+    q = quaternion_from_matrix(R)
+    x, y, z, w = q[:, i], q[:, j], sign * q[:, k], q[:, 3]
+    if is_proper:
+        near, far = np.array([w, x]), np.array([y, z])
+    else:
+        near, far = np.array([w - y, x + z]), np.array([y + w, z - x])
+    middle = 2 * np.arctan2(np.hypot(*far), np.hypot(*near))
+    half_sum = np.arctan2(near[1], near[0])
+    half_difference = np.arctan2(far[1], far[0])
+    half_sum = np.where(np.hypot(*near) < _LOCKED, half_difference, half_sum)
+    half_difference = np.where(np.hypot(*far) < _LOCKED, half_sum, half_difference)
+    first = half_sum - half_difference
+    last = half_sum + half_difference
+    if not is_proper:
+        middle = middle - math.pi / 2
+        last = sign * last
+    turned = np.stack([_wrapped(first), middle, _wrapped(last)], axis=1)
+    return np.asarray(turned if sequence.islower() else turned[:, ::-1])
+
+
+def _wrapped(angle: Array) -> Array:
+    """Bring angles into [-π, π]."""
+    return np.asarray(angle - 2 * math.pi * np.round(angle / (2 * math.pi)))
 
 
 _MM = UNITS["mm"]
@@ -99,6 +189,7 @@ NAMED = {
     "fanuc-xyzwpr": Convention("xyz", _MM, True),
     "abb-quaternion": Convention("wxyz", _MM),
     "ur-rotvec": Convention("rotvec"),
+    "ur-pendant": Convention("rotvec", _MM),
     "xarm-rpy": Convention("xyz", _MM, True),
     "easy-handeye": Convention("xyzw"),
     "moveit": Convention("matrix"),

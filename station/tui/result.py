@@ -16,7 +16,15 @@ from textual.content import Content
 from textual.widgets import DataTable, Static
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.formatting import accuracy_text, arm_sentences, figures, noise_text, pose_text, use_text
+from calibrate.files.formatting import (
+    accuracy_text,
+    arm_sentences,
+    figures,
+    noise_text,
+    pendant_texts,
+    pose_text,
+    use_text,
+)
 from calibrate.files.install import change_text
 from calibrate.files.touch import LIMIT_SIGMAS, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import ValidityState, validity_text
@@ -165,11 +173,13 @@ def change_lines(result: Result, calibration: Calibration) -> list[Content]:
 
 
 def pose_lines(calibration: Calibration) -> list[Content]:
-    """Write the camera pose, its standard uncertainty, and the arm's part in it."""
+    """Write the camera pose, also as pendants show it, its standard uncertainty, and the arm's part in it."""
     result, sigma = calibration.result, calibration.sigma
+    written = pendant_texts(calibration)
     return [
         dim(f"{result.parent_frame}_from_{result.child_frame}"),
         *(Content.styled(words.strip(), "bold $strong") for words in pose_text(calibration).split(",")),
+        *(Content.assemble((f"{maker:<6}", "$dim"), text) for maker, text in written.items()),
         dim(f"position ± {sigma.translation_mm:.2f} mm, rotation ± {sigma.rotation_deg:.3f}° (1σ)"),
         *map(Content, arm_sentences(calibration)),
     ]

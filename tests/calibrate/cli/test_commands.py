@@ -310,3 +310,16 @@ def test_the_report_is_one_page_with_no_network(small_session_file: Path, tmp_pa
     assert "SIMULATED" in page[: first + 200]
     assert page.count("data:image/jpeg") == 1 + 5
     assert page.count("<summary>") >= 6
+
+
+def test_numbers_to_paste_from_the_command_line(real_file: Path, tmp_path: Path) -> None:
+    done = run("export", real_file, "--as", "kuka-abc", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].startswith("{X ")
+    assert run("export", real_file, "--as", "ur-rotvec", "-o", "x.txt", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "x.txt").read_text().splitlines()[-1].startswith("p[")
+    refused(run("export", real_file, "--as", "kuka", cwd=tmp_path), 1, "no-convention")
+    refused(run("export", real_file, cwd=tmp_path), 2, "options")
+    refused(run("export", real_file, "--as", "kuka-abc", "--to", "zivid", cwd=tmp_path), 2, "options")
+    given = run("export", real_file, "--as", "kuka-abc", "--arm", real_file, cwd=tmp_path)
+    refused(given, 2, "arm-of-urdf")

@@ -20,13 +20,14 @@ from calibrate.arms.kinematics import MODELS, DhTable, RobotModel, forward, tabl
 from calibrate.errors import CalibrationError, CalibrationFileError, InstallError, UsageError
 from calibrate.files import exports
 from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration
-from calibrate.files.exports import FORMATS, FrameNames
+from calibrate.files.exports import FORMATS, FrameNames, export_numbers
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
 from calibrate.handeye.arm_table import CorrectedArm, FramePose
 from calibrate.pipeline.job import SolvedRecording
 from calibrate.pipeline.recorded_views import arm_of_ros
 from calibrate.results import PointError
 from recordings.geometry import Array, FrameMismatchError, Transform, inverse, pose, rotation_exp
+from recordings.importers.conventions import NAMED, convention
 from recordings.schema.messages import RobotIdentity
 from tests.codes import raises
 
@@ -175,6 +176,41 @@ BY_A_TEST = {"opencv", "ros-camera-info", "ur-kinematics", "urdf"}
 @pytest.mark.parametrize("name", READERS)
 def test_the_camera_is_where_the_calibration_has_it(calibration: Calibration, name: str) -> None:
     same(READERS[name](export(calibration, name)), calibration)
+
+
+@pytest.mark.parametrize("name", [*NAMED, "euler-zyz-deg-cm", "rotvec-first-inverse"])
+def test_numbers_to_paste_are_read_as_an_import_reads_them(calibration: Calibration, name: str) -> None:
+    """Whatever stands between the numbers: braces and letters of the maker's own program."""
+    *told, line = export_numbers(calibration, name).decode().splitlines()
+    numbers = [float(word) for word in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])", line)]
+    (back,) = convention(name).poses(np.array([numbers]))
+    same(back, calibration, 1e-11)
+    assert all(words.startswith("# ") for words in told)
+    where = f"{calibration.transform.parent}_from_camera"
+    assert any(where in words and convention(name).about in words for words in told)
+
+
+def test_numbers_to_paste_refuse_what_a_file_of_one_frame_refuses(calibration: Calibration) -> None:
+    with raises("frames-of", UsageError):
+        export_numbers(calibration, "kuka-abc", FrameNames(base="its base"))
+    with raises("attach-of", UsageError):
+        export_numbers(calibration, "kuka-abc", FrameNames(attach="camera_link"))
+    with raises("no-convention"):
+        export_numbers(calibration, "kuka")
+    doubt = ValidityReason("drift-check", "It moved.", {})
+    doubted = Validity(1, ValidityState.IN_DOUBT, "2026-01-01T00:00:00+00:00", doubt)
+    with raises("calibration-in-doubt", InstallError):
+        export_numbers(calibration, "kuka-abc", FrameNames(validity=doubted))
+
+
+def test_no_number_to_paste_has_an_exponent(calibration: Calibration) -> None:
+    tiny = pose(rotation_exp([1e-9, -2e-7, 3e-20]), [1e-8, -1e-9, 1e-30])
+    small = msgspec.structs.replace(
+        calibration, result=FramePose.of(Transform(calibration.result.parent_frame, "camera", tiny))
+    )
+    for name in NAMED:
+        line = export_numbers(small, name).decode().splitlines()[-1]
+        assert not re.search(r"\de[-+]", line) and "-0," not in line
 
 
 def test_every_format_has_a_reader() -> None:

@@ -63,7 +63,7 @@ bench: $(READY)  ## the benchmarks; tables go to docs/contributor/benchmarks.md
 
 pages: $(READY)  ## the pages of docs/ that are made from the sources
 	for page in api cli errors protocol; do $(BIN)/python docs/$$page.py > docs/reference/$$page.md; done
-	for page in gates formats; do $(BIN)/python docs/tables.py $$page > docs/reference/$$page.md; done
+	for page in gates formats words; do $(BIN)/python docs/tables.py $$page > docs/reference/$$page.md; done
 	for page in configuration json; do $(BIN)/python docs/structs.py $$page > docs/reference/$$page.md; done
 	$(BIN)/python docs/decisions.py > docs/decisions/README.md
 	$(BIN)/python docs/schemas.py

@@ -1,4 +1,4 @@
-"""Prints docs/reference/gates.md or formats.md from docstrings: `python docs/tables.py gates`."""
+"""Prints docs/reference/gates.md, formats.md or words.md: `python docs/tables.py gates`."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import inspect
 import runpy
 import sys
 from collections.abc import Callable, Iterator
+from itertools import groupby
 from pathlib import Path
 
 import msgspec
 
 from calibrate.files.exports import FORMATS
 from calibrate.pipeline.gates import GateLimits
+from calibrate.words import words
 
 texts_of_fields: Callable[[type], dict[str, str]] = runpy.run_path(
     str(Path(__file__).with_name("structs.py"))
@@ -41,8 +43,24 @@ def formats() -> Iterator[str]:
         yield f"| `{name}` | {form.suffix} | {first} | {' '.join(holds.split())} |"
 
 
+def word_table() -> Iterator[str]:
+    """A table a group: word, meaning with its unit, what to do when it is bad, words not used for it."""
+    yield (
+        "One word for each thing, on screens, in messages and on these pages; F1 on the screen shows them, "
+        "too. Keys of files and JSON keep the names that they have."
+    )
+    for group, members in groupby(words(), key=lambda word: word.group):
+        yield from ("", f"## {group}", "", "| word | meaning | when it is bad | not |", "|-|-|-|-|")
+        for word in members:
+            unit = f" In {word.unit}." if word.unit else ""
+            gate = f" Gate: [`{word.gate}`](gates.md)." if word.gate else ""
+            retired = ", ".join(word.retired)
+            yield f"| {word.term} | {word.meaning}{unit}{gate} | {word.bad} | {retired} |"
+
+
 PAGES = {
     "gates": ("Gates", "calibrate/pipeline/gates.py", gates),
+    "words": ("Words", "calibrate/words.toml", word_table),
     "formats": ("Export formats", "calibrate/files/exports/", formats),
 }
 

@@ -27,6 +27,7 @@ MADE = {
     "reference/gates": "tables gates",
     "reference/json": "structs json",
     "reference/protocol": "protocol",
+    "reference/words": "tables words",
 }
 
 

@@ -17,6 +17,8 @@ from recordings.schema.messages import BoardSpec
 FILE = "checks.jsonl"
 _BY_CHANCE = 0.001
 """p from which a failed check is weak evidence, to be repeated before anything is done."""
+_RARE = 1e-6
+"""p below which nobody needs to know how small it is."""
 
 
 class Trend(msgspec.Struct, frozen=True):
@@ -65,8 +67,19 @@ class CheckEntry(msgspec.Struct, frozen=True, omit_defaults=True):
 def advice_on_failure(p_value: float) -> str:
     """Say what to do after a check that failed."""
     if p_value >= _BY_CHANCE:
-        return f"Weak evidence (p = {p_value:.3f}). Repeat the check."
+        return "That is weak evidence. Repeat the check."
     return "Check the camera's bracket, and calibrate again."
+
+
+def chance_text(p_value: float) -> str:
+    """Say in how many checks chance alone shows a shift as large, while nothing moved."""
+    if p_value >= _BY_CHANCE:
+        checks = f"{100 * p_value:.2g} of 100"
+    elif p_value >= _RARE:
+        checks = f"1 of {round(1 / p_value, -3):,.0f}"
+    else:
+        checks = f"less than 1 of {1 / _RARE:,.0f}"
+    return f"a shift as large comes by chance in {checks} checks"
 
 
 def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN_CAMERA) -> None:

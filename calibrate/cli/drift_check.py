@@ -19,7 +19,7 @@ from calibrate.check.drift import (
     known_cell,
     moved_point,
 )
-from calibrate.check.history import Trend, advice_on_failure, append_check, read_checks
+from calibrate.check.history import Trend, advice_on_failure, append_check, chance_text, read_checks
 from calibrate.check.production import MOST_PICTURES, check_production
 from calibrate.check.same_cell import OtherCellError, require_same_cell
 from calibrate.check.trend import entry_of, find_trend
@@ -182,7 +182,7 @@ def _judged(result: DriftCheck, recording: str) -> tuple[ValidityReason, bool, b
     reason = ValidityReason(
         "drift-check",
         f"Drift check {verdict}: camera shift {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° "
-        f"(p = {result.p_value:.1e}).",
+        f"({chance_text(result.p_value)}).",
         {
             "recording": recording,
             "shift_mm": round(result.shift_mm, 4),
@@ -227,12 +227,13 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
     if not result.passed:
         text = (
             f"FAIL: camera shift {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° "
-            f"(p = {result.p_value:.1e}).{_moved_text(result, calibration)} "
+            f"({chance_text(result.p_value)}).{_moved_text(result, calibration)} "
             f"{advice_on_failure(result.p_value)}"
         )
     else:
         verdict = "PASS" if result.power >= POWER else "PASS, low sensitivity"
-        text = f"{verdict}: the camera pose holds on {result.views} new views (p = {result.p_value:.2f})."
+        text = f"{verdict}: the camera pose holds on {result.views} new views"
+        text += f" ({chance_text(result.p_value)})."
     if not result.arm_known:
         text += " The arm's own errors are unknown: a failure may be theirs. Solve with recorded joints."
     found = f"0.5 mm in {result.power_translation:.0%}, a turn of 0.1° in {result.power_rotation:.0%}"
@@ -262,7 +263,8 @@ def production_text(result: DriftCheck, pictures: int) -> str:
         return f"PASS: nothing moved, by {pictures} pictures."
     return (
         f"FAIL: camera or tag shifted {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° within the last "
-        f"{result.views} pictures (p = {result.p_value:.1e}). Check both, and run station drift-check."
+        f"{result.views} pictures ({chance_text(result.p_value)}). "
+        "Check both, and run station drift-check."
     )
 
 

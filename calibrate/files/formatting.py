@@ -122,9 +122,9 @@ def noise_text(calibration: Calibration) -> str:
 
 
 def error_shares(calibration: Calibration) -> dict[str, float]:
-    """The sources of the error of X with their shares of its variance, the largest first."""
+    """The sources of the error of X, keys of `SOURCES`, with their shares of its variance, largest first."""
     shares = sorted(calibration.quality.error_shares.items(), key=lambda item: -item[1])
-    return {name.replace("_", " "): share for name, share in shares if share > 0.005}
+    return {name: share for name, share in shares if share > _SMALL_SHARE}
 
 
 def verdict_text(calibration: Calibration) -> str:
@@ -199,7 +199,8 @@ def _result_table(calibration: Calibration) -> Table:
         rms = "" if lens.rms_px is None else f"  RMS {lens.rms_px:.3f} px"
         table.add_row("intrinsics", f"f {fx:.1f} {fy:.1f}  c {cx:.1f} {cy:.1f} px{rms}  ({lens.found})")
     if shares := error_shares(calibration):
-        table.add_row("error comes from", ", ".join(f"{name} {share:.0%}" for name, share in shares.items()))
+        named = (f"{SOURCES.get(name, name)} {share:.0%}" for name, share in shares.items())
+        table.add_row("error comes from", ", ".join(named))
     table.add_row("board", describe_board(calibration.board))
     robot, camera = calibration.robot, calibration.camera
     table.add_row(
@@ -229,9 +230,19 @@ _REMEDIES = {
     "board": "measure the board and state its tolerance (square_tolerance, flatness_m)",
     "kinematics": "have the arm calibrated",
     "corners": "take better or more images",
-    "robot translation": "take more poses",
-    "robot rotation": "take more poses",
+    "robot_translation": "take more poses",
+    "robot_rotation": "take more poses",
 }
+SOURCES = {
+    "intrinsics": "lens",
+    "board": "board",
+    "kinematics": "the arm's own error",
+    "corners": "noise of corners",
+    "robot_translation": "noise of the arm's positions",
+    "robot_rotation": "noise of its orientations",
+}
+"""Sources of the error of X, by their names in the file, in words."""
+_SMALL_SHARE = 0.005
 
 
 def cell_sentences(calibration: Calibration) -> list[str]:
@@ -245,7 +256,8 @@ def cell_sentences(calibration: Calibration) -> list[str]:
         remedy, arm = _REMEDIES[name], calibration.arm_table
         if name == "kinematics" and arm is not None and arm.offered:
             remedy = "use the corrected arm"
-        sentences.append(f"Largest error source: {name}, {share:.0%} of the variance. To lower it, {remedy}.")
+        source = f"{SOURCES[name]}, {share:.0%} of the variance"
+        sentences.append(f"Largest error source: {source}. To lower it, {remedy}.")
     return sentences
 
 

@@ -1,8 +1,9 @@
 """Gates: named conditions that a calibration must meet before it may be installed.
 
-A gate is, under one name, a limit in `GateLimits`, whose text says when it closes, and a figure that
-`_measured` yields of the solution, with title, unit and remedy. Terminal, screen, report, `--json`, the file
-of limits and docs/reference/gates.md (`make pages`) take all gates from here.
+A gate is, under one name, a limit in `GateLimits`, whose text says when it closes, a figure that `_measured`
+yields of the solution, and a word of `calibrate/words.toml`, with title, meaning and remedy. Terminal,
+screen, report, `--json`, the file of limits and docs/reference/gates.md (`make pages`) take all gates from
+here.
 
 To add one:
   1. Compute the figure in `handeye/metrics.py`; test it in tests/calibrate/handeye/test_metrics.py.
@@ -12,10 +13,10 @@ To add one:
      Joints are `handeye.arm.recorded_joints(views)`: those of `CellFit.arm` may be computed from poses.
      The solver sees no pictures: a figure of a picture is first a field of `views.BoardView`, filled in
      `recorded_views.py` (of a recording) and `pictures.py` (of pictures that a program gives).
-  3. Here add its limit and its figure; `unit` is a key of `results.UNITS_SHOWN`. A gate without a value has
-     a function of its own that `judge` calls, such as `_session_gate`. A figure passes or fails; a warning is
-     a gate that passed and has a remedy: `_arm_gate`, or one named in `ADVICE`, where the stated error holds
-     already what the gate misses.
+  3. Add its word to `calibrate/words.toml`, and here its limit and its figure; `unit` is a key of
+     `results.UNITS_SHOWN`. A gate without a value has a function of its own that `judge` calls, such as
+     `_session_gate`. A figure passes or fails; a warning is a gate that passed and has a remedy: `_arm_gate`,
+     or one named in `ADVICE`, where the stated error holds already what the gate misses.
   4. In tests/calibrate/pipeline/test_gates.py put a good value into the fixture `solution`, a bad one into
      `spoiled`.
 """
@@ -31,6 +32,7 @@ import numpy as np
 from calibrate.arms.classes import ARM_CLASSES, UNKNOWN
 from calibrate.handeye.solution import Judgement, Reading, Solution
 from calibrate.results import Gate, PointError, Sense
+from calibrate.words import words_of_gates
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,12 +105,15 @@ def judge(
     if limits.arm and solution.profile == "robust":
         found.append(_arm_gate(solution.judgement.figures.point, limits.arm))
     point = solution.judgement.figures.point
-    for name, value, title, sense, unit, remedy in _measured(solution, clock_bound_s):
+    for figure in _measured(solution, clock_bound_s):
+        name = figure.name
         stated = getattr(limits, name)
         limit = ADVICE.get(name) if stated is None else stated
-        if value is None or limit is None:
+        if figure.value is None or limit is None:
             continue
-        gate = Gate.measured(name, title, value, sense, limit, unit, remedy)
+        gate = Gate.measured(
+            name, figure.title, figure.value, figure.sense, limit, figure.unit, figure.remedy
+        )
         if not gate.passed and stated is None and point is not None:
             gate = gate.as_advice(_cost(name, point))
         if not gate.passed and name == "predicted_error_m" and _by_assumption_alone(point, limit):
@@ -151,23 +156,33 @@ def _by_assumption_alone(point: PointError | None, limit_m: float) -> bool:
 
 
 class _Figure(NamedTuple):
-    """What `Gate.measured` judges by the limit of this name."""
+    """What `Gate.measured` judges by the limit of this name; title and remedy are in the table of words."""
 
     name: str
     value: float | None
     """In `unit`; None: not judged."""
-    title: str
-    """What is measured, for people."""
     sense: Sense
     unit: str
     """Of value and limit, a key of `results.UNITS_SHOWN`: m, deg, s, px, share; empty for plain numbers."""
-    remedy: str
-    """Next step where the gate is closed."""
+    about: str = ""
+    """What of it is told in brackets behind the title."""
+    way: str = ""
+    """What of this solution the remedy is told more by."""
+
+    @property
+    def title(self) -> str:
+        """What is measured, for people."""
+        return f"{_title(self.name)} ({self.about})" if self.about else _title(self.name)
+
+    @property
+    def remedy(self) -> str:
+        """Next step where the gate is closed."""
+        return f"{words_of_gates()[self.name].bad} {self.way}".rstrip()
 
 
-_ARM = "Check payload, mounting, looseness of board and camera, and the robot's calibrated kinematics."
-_LENS = "Solve with --estimate-intrinsics, or calibrate the camera again."
-_BOARD = "Measure the squares both ways and the flatness, correct square_m and solve again."
+def _title(name: str) -> str:
+    term = words_of_gates()[name].term
+    return term[:1].upper() + term[1:]
 
 
 def _measured(solution: Solution, clock_bound_s: float | None) -> Iterator[_Figure]:
@@ -180,66 +195,51 @@ def _measured(solution: Solution, clock_bound_s: float | None) -> Iterator[_Figu
     distance_m = figures.working_distance_m or 0.0
     weights = list(evidence.weights.values())
     weight = float(np.mean(weights)) if weights else None
-    yield _Figure(
-        "weight", weight, "Mean view weight", "≥", "share", "Retake the rejected and suspect views."
-    )
-    remedy = "Capture more poses that show the board."
-    yield _Figure("views", len(evidence.views.used), "View count", "≥", "", remedy)
-    largest_deg = float(np.degrees(seen.largest_angle_rad))
-    remedy = "Add poses with more tilt and roll."
-    yield _Figure("rotation_deg", largest_deg, "Rotation range", "≥", "deg", remedy)
-    remedy = f"Add rotations about other axes: {seen.weakest_text}."
-    yield _Figure("axis_spread", seen.axis_spread, "Rotation diversity", "≥", "", remedy)
+    least_known = f"Least known: {seen.weakest_text}."
+    yield _Figure("weight", weight, "≥", "share")
+    yield _Figure("views", len(evidence.views.used), "≥", "")
+    yield _Figure("rotation_deg", float(np.degrees(seen.largest_angle_rad)), "≥", "deg")
+    yield _Figure("axis_spread", seen.axis_spread, "≥", "", way=least_known)
     if px := evidence.rms_px:
         worst = max(px, key=lambda index: px[index])
-        title = f"Largest rms error of a view (pose {worst + 1})"
-        remedy = f"Retake pose {worst + 1}, or check the intrinsics."
-        yield _Figure("view_rms_px", px[worst], title, "≤", "px", remedy)
+        at = f"pose {worst + 1}"
+        yield _Figure("view_rms_px", px[worst], "≤", "px", about=at, way=f"It is {at}.")
     if figures.holdout is not None and distance_m:
         missed_m = figures.holdout.e_t_m
-        title = f"Held-out error ({1e3 * missed_m:.2g} mm)"
-        remedy = "Check robot accuracy and corner detection."
-        yield _Figure("holdout_share", missed_m / distance_m, title, "≤", "share", remedy)
+        missed = f"{1e3 * missed_m:.2g} mm"
+        yield _Figure("holdout_share", missed_m / distance_m, "≤", "share", about=missed)
     if folds is not None:
-        errors = f"({folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm; 1 is what chance explains)"
         ratio = folds.rms_mm / folds.claimed_mm / folds.limit
-        remedy = "Check intrinsics, board and looseness of the mounts."
-        yield _Figure("cross_validation", ratio, f"Cross-validated error {errors}", "≤", "", remedy)
-    title = f"Error of a placed point at {distance_m * 1e3:.0f} mm"
-    remedy = f"Least known: {seen.weakest_text}. Add rotations about that direction."
+        missed = f"{folds.rms_mm:.2f} mm, predicted {folds.claimed_mm:.2f} mm; 1 is what chance explains"
+        yield _Figure("cross_validation", ratio, "≤", "", about=missed)
     error_mm = figures.predicted_error_mm
     error_m = None if error_mm is None else error_mm / 1e3
-    yield _Figure("predicted_error_m", error_m, title, "≤", "m", remedy)
+    at = f"at {distance_m * 1e3:.0f} mm"
+    yield _Figure("predicted_error_m", error_m, "≤", "m", about=at, way=least_known)
     coverage = judgement.coverage if solution.fit.lens_estimated else None
-    remedy = "Bring the board into the corners of the image."
-    yield _Figure("coverage", coverage, "Image coverage", "≥", "share", remedy)
-    remedy = "Check the camera's clock, or use a hardware trigger."
-    yield _Figure("clock_bound_s", clock_bound_s, "Time sync", "≤", "s", remedy)
-    for name, finding, title, remedy in (
-        ("lens_pull", judgement.lens_finding, "Shift by fixed intrinsics", _LENS),
-        ("board_pull", judgement.board_finding, "Shift by the stated board", _BOARD),
-    ):
+    yield _Figure("coverage", coverage, "≥", "share")
+    yield _Figure("clock_bound_s", clock_bound_s, "≤", "s")
+    for name, finding in (("lens_pull", judgement.lens_finding), ("board_pull", judgement.board_finding)):
         if finding is not None:
             of_mm = f"{finding.unexplained_m * 1e3:.2f} of {finding.pull_m * 1e3:.2f} mm"
-            title += f" ({of_mm} unexplained; 1 is the error of X)"
-            yield _Figure(name, finding.unexplained_m / finding.error_m, title, "≤", "", remedy)
+            about = f"{of_mm} unexplained; 1 is the error of the camera pose"
+            yield _Figure(name, finding.unexplained_m / finding.error_m, "≤", "", about=about)
     if noise is not None:
-        yield _Figure("robot_error_m", noise.robot_m, "Position noise", "≤", "m", _ARM)
-        noise_deg = float(np.degrees(noise.robot_rad))
-        yield _Figure("robot_error_deg", noise_deg, "Orientation noise", "≤", "deg", _ARM)
+        yield _Figure("robot_error_m", noise.robot_m, "≤", "m")
+        yield _Figure("robot_error_deg", float(np.degrees(noise.robot_rad)), "≤", "deg")
 
 
 def _arm_gate(point: PointError | None, limit: Literal["warn", "fail"]) -> Gate:
     if point is None or point.arm != "assumed":
         known = "" if point is None else f", {point.arm}"
-        return Gate("arm", True, None, None, f"Arm's own error: in the stated one{known} PASS")
+        return Gate("arm", True, None, None, f"{_title('arm')}: in the stated one{known} PASS")
     of_class = ARM_CLASSES[point.arm_class].title
     remedy = (
         "Record joints, or state --robot-accuracy-mm."
         if point.arm_class != UNKNOWN
-        else "Record joints, or tell the arm: robot.model, --arm-class or --robot-accuracy-mm."
+        else words_of_gates()["arm"].bad
     )
-    text = f"Arm's own error: assumed as of {of_class}, {limit.upper()}. {remedy}"
+    text = f"{_title('arm')}: assumed as of {of_class}, {limit.upper()}. {remedy}"
     return Gate("arm", limit == "warn", None, None, text, remedy=remedy)
 
 
@@ -249,5 +249,5 @@ def _session_gate(judgement: Judgement) -> Gate:
     told = next((remark.text for remark in judgement.warnings if remark.code == session.reading.value), "")
     remedy = "" if passed else told
     found = "yes PASS" if passed else f"no, {session.reading.value} FAIL. {told}"
-    text = f"Poses and board as told: {found}".rstrip()
+    text = f"{_title('session')}: {found}".rstrip()
     return Gate("session", passed, session.log_evidence_gain, None, text, remedy=remedy)

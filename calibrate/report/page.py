@@ -14,6 +14,7 @@ from calibrate.boards.corners import to_grey
 from calibrate.boards.model import board_points, describe_board
 from calibrate.files.formatting import (
     SOURCE_STAMPS,
+    SOURCES,
     arm_sentences,
     cell_sentences,
     error_shares,
@@ -227,7 +228,7 @@ def _plots(job: SolvedRecording) -> Iterator[str]:
         yield html.figure(html.bars(robot_mm, "mm"), answer, "Was the arm where it said?")
     if shares := error_shares(job.calibration):
         answer = "Shares of the variance of the camera pose."
-        rows = [(name, f"{share:.0%}") for name, share in shares.items()]
+        rows = [(SOURCES.get(name, name), f"{share:.0%}") for name, share in shares.items()]
         yield html.figure(html.table(("", ""), rows, (1,)), answer, "Where does the error come from?")
 
 

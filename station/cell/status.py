@@ -269,7 +269,7 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
 class LeaseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     holder: str = ""
-    """Client that has control, as 'anna on tty1 (pid 4711)'; empty: none"""
+    """Client that has control, as 'anna, console 1'; empty: none"""
     client_id: int | None = None
 
 

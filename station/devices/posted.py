@@ -365,10 +365,10 @@ def _jump(before: Vector6, after: Vector6, seconds: float) -> StaleStateError | 
 
 
 def _name_of(link: socket.socket) -> str:
-    """Name the program at the other end: 'python3 (pid 4711)'."""
+    """Name the program at the other end: 'python3 (process 4711)'."""
     if link.family is not socket.AF_UNIX:
         return "a program by TCP"
     pid = peer_of(link)[0]
     with contextlib.suppress(OSError):
-        return f"{Path(f'/proc/{pid}/comm').read_text().strip()} (pid {pid})"
+        return f"{Path(f'/proc/{pid}/comm').read_text().strip()} (process {pid})"
     return f"pid {pid}"

@@ -94,7 +94,7 @@ def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
         ("Distance", f"{preview.path_m:.2f} m of flange path, largest joint turn {turn_deg:.0f}°"),
         ("Speed", f"up to {preview.top_speed_m_s:.2f} m/s at any point of arm, tool and camera"),
         ("Duration", f"about {preview.duration_s // 60:.0f}:{preview.duration_s % 60:02.0f} min"),
-        ("Hash", f"{preview.approval_sha256[:HASH_DIGITS]} of plan and cell"),
+        ("Hash", f"{preview.approval_sha256[:HASH_DIGITS]} stands for exactly this plan and cell"),
         *(("WARNING", warning) for warning in preview.warnings),
     ]
 

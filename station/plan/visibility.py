@@ -217,5 +217,5 @@ def _why(layout: CellLayout, view: ExpectedView) -> str:
     )
     return (
         f"{1000 * view.distance_m:.0f} mm, tilt {np.rad2deg(view.tilt_rad):.0f}°, "
-        f"roll {np.rad2deg(view.roll_rad):+.0f}°, board {side or 'centred'}"
+        f"turned {np.rad2deg(view.roll_rad):+.0f}°, board {side or 'centred'}"
     )

@@ -56,6 +56,18 @@ def _terminal_name(number: int) -> str:
     return f"terminal {major}:{minor}"
 
 
+def place_text(terminal: str) -> str:
+    """Say where a terminal is, as a person would: 'terminal window 3' of pts/3, 'console 1' of tty1."""
+    kind, _, number = terminal.partition("/")
+    if kind == "pts":
+        return f"terminal window {number}"
+    if terminal.startswith("ttyS"):
+        return f"serial console {terminal.removeprefix('ttyS')}"
+    if terminal.startswith("tty"):
+        return f"console {terminal.removeprefix('tty')}"
+    return terminal
+
+
 @dataclass
 class Peer:
     """Client process of a connection, as the kernel tells of it."""
@@ -73,9 +85,9 @@ class Peer:
 
     @property
     def who(self) -> str:
-        """Name of the client in log, status and recording, as 'anna on tty1 (pid 4711)'."""
-        place = f" on {self.terminal}" if self.terminal else ""
-        return f"{self.user or f'uid {self.uid}'}{place} (pid {self.pid})"
+        """Name of the client in screen, log, status and recording, as 'anna, terminal window 3'."""
+        place = place_text(self.terminal) if self.terminal else f"process {self.pid}"
+        return f"{self.user or f'user {self.uid}'}, {place}"
 
 
 @dataclass(frozen=True)
@@ -83,7 +95,7 @@ class Approval:
     """Permission that was given to start an offered motion."""
 
     how: str
-    """How it was given, for log and recording: 'at pts/3', 'as a service, …'."""
+    """How it was given, for log and recording: 'at terminal window 3', 'as a service, …'."""
     by_person: bool
     """A person at a terminal gave it, who has looked at the cell; False: a service or a simulated cell."""
 
@@ -112,7 +124,7 @@ class ApprovalRule:
             return "a simulated cell"
         if terminal := self.terminal(asks):
             self._require_permitted(asks)
-            return f"at {terminal}"
+            return f"at {place_text(terminal)}"
         if service := self._service(asks):
             raise RefusedError("service-terminal", what=what, service=service)
         raise RefusedError(

@@ -8,18 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from textual import events, work
-from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
-from textual.command import DiscoveryHit, Hits, Provider
-from textual.screen import Screen
-from textual.system_commands import SystemCommandsProvider
 
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from station.cell.errors import StationError
@@ -33,6 +27,8 @@ from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
 from station.tui.daemon_link import SILENT_S, DaemonApp, DaemonLink, TerminalWatch
 from station.tui.dialogs import Confirm, ConfirmFinish, ConfirmMotion
+from station.tui.frame import Question
+from station.tui.help import Help
 from station.tui.installed import Marks, marks, read_result, read_sessions, solved_file, state_root
 from station.tui.jobs import check_drift, solve_session
 from station.tui.live_page import SIDE_PX, LivePageApp, news_of
@@ -62,24 +58,13 @@ SCREENS: tuple[type[StationScreen], ...] = (
 )
 
 
-class HelpInOrder(SystemCommandsProvider):
-    """Commands of F1 as `get_system_commands` orders them, before anything is typed.
-
-    Textual sorts them by name and preselects the first, which was "Acknowledge": F1 and Enter left STOP.
-    """
-
-    async def discover(self) -> Hits:
-        for command in self.app.get_system_commands(self.screen):
-            yield DiscoveryHit(command.title, command.callback, help=command.help)
-
-
 class StationApp(LivePageApp[None], DaemonApp):
     """One app, several screens; the same keys everywhere.
 
     Screens are drawn from `known` alone. What they ask for goes to the daemon by `daemon`.
     """
 
-    COMMANDS: ClassVar[set[type[Provider] | Callable[[], type[Provider]]]] = {HelpInOrder}
+    ENABLE_COMMAND_PALETTE = False  # in its place: `Help`
     TITLE = "Calibration station"
     CSS_PATH = "station.tcss"
     MODES: ClassVar[dict[str, type[StationScreen]]] = {screen.MODE: screen for screen in SCREENS}  # type: ignore[assignment]
@@ -290,24 +275,17 @@ class StationApp(LivePageApp[None], DaemonApp):
         if not held or await self.link.ask_person(Confirm("Close the screen?", HELD, yes="Close")):
             self.exit()
 
-    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """List every key's action by name; what moves the arm asks first from here too.
-
-        The theme is first, because the first is preselected: nothing that unlatches, moves, deletes or ends
-        may be. Of Textual's own there is no other: they hide the frame, with STOP, or quit unasked.
-        A question is answered first: over it only what works there by its key.
-        """
-        yield SystemCommand("Theme", "Dark, light, or the terminal's own colours", self.action_change_theme)
-        own = screen.BINDINGS if isinstance(screen, StationScreen) else []
-        for place, bindings in ((screen, own), (self, self.BINDINGS)):
-            for binding in (b for b in bindings if isinstance(b, Binding) and b.tooltip):
-                if not binding.priority and not isinstance(screen, StationScreen):
-                    continue
-                yield SystemCommand(
-                    f"{binding.description} ({binding.key})",
-                    binding.tooltip,
-                    partial(self.call_later, self.run_action, binding.action, place),
-                )
+    @work(exclusive=True, group="help", exit_on_error=False)
+    async def action_help(self) -> None:
+        """Show help, and do what is chosen; an action of another screen is only led to."""
+        under = self.screen
+        if isinstance(under, Help) or (chosen := await self.link.ask_person(Help(under))) is None:
+            return
+        if chosen.mode in ("", self.current_mode) or isinstance(under, Question):
+            await self.run_action(chosen.action, self.screen if chosen.mode else self)
+            return
+        await self.switch_mode(chosen.mode)
+        self.notify(f"{chosen.key.split()[-1]}, here: {chosen.text}.", title=chosen.name, markup=False)
 
 
 def _one_more(before: SessionStatus, now: SessionStatus) -> bool:

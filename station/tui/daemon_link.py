@@ -171,8 +171,7 @@ class DaemonLink:
 
     def has_control(self) -> bool:
         """Tell whether this screen has control."""
-        holder = None if self.known.live is None else self.known.live.lease.client_id
-        return holder is not None and holder == self.client.own_id
+        return self.known.has_control
 
     async def stop(self) -> None:
         """STOP, whatever is shown, and also where nobody answers or no connection is left."""

@@ -99,7 +99,7 @@ class ConfirmMotion(Confirm):
     def show(self, known: Known) -> None:
         """Close where STOP, a fault or the daemon's end made an answer useless.
 
-        Below the command palette only once that is closed: Textual would close the palette instead.
+        Below help only once that is closed: Textual would close help instead.
         """
         super().show(known)
         if self.is_active and (known.live is None or known.live.state not in Go.states):

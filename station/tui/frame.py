@@ -8,7 +8,7 @@ from typing import Any, ClassVar, TypeVar
 
 from rich.filesize import decimal
 from textual.app import ComposeResult
-from textual.binding import ActiveBinding
+from textual.binding import ActiveBinding, Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.content import Content
 from textual.markup import escape
@@ -126,10 +126,10 @@ def _bar_parts(known: Known, title: str) -> Iterator[Content]:
     yield Content.styled(f" {chip} ", style)
     if status.source == "simulated":
         yield Content.styled(" SIMULATED ", "bold $sim on $simbg")
-    yield from _robot_parts(status)
+    yield from _robot_parts(status, known.has_control)
 
 
-def _robot_parts(status: StationStatus) -> Iterator[Content]:
+def _robot_parts(status: StationStatus, has_control: bool) -> Iterator[Content]:
     robot = status.robot
     if robot.by_hand:
         model = shortened(robot.model or "no arm", MODEL_CELLS)
@@ -152,7 +152,7 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
     if robot.remote is not None:
         yield dim(f"  {'remote' if robot.remote else 'LOCAL'}")
     if status.lease.holder:
-        yield dim(f"  control: {status.lease.holder}")
+        yield dim(f"  control: {'this screen' if has_control else status.lease.holder}")
     if status.session.elapsed_s:
         yield dim(f"  {duration(status.session.elapsed_s)}")
 
@@ -320,6 +320,7 @@ class Question(ModalScreen[R], Framed[R]):
     AUTO_FOCUS = "*"
     NAME, NEXT = "Question", ANSWER
     BOX: ClassVar[str] = "dialog"
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("f1", "app.help", "Words", show=False)]
 
     def __init__(self, title: str = "", words: str = "") -> None:
         super().__init__()

@@ -29,9 +29,11 @@ from calibrate.files.install import change_text
 from calibrate.files.touch import LIMIT_SIGMAS, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import ValidityState, validity_text
 from calibrate.results import Gate
+from calibrate.words import Word, word_of, words_in, words_of_gates
 from recordings.cli.console import open_in_browser
 from station.cell.session_folder import REPORT_FILE
 from station.operate.next_step import StepKind, after_solve
+from station.tui.help import Explained
 from station.tui.installed import Result, local
 from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
@@ -42,8 +44,8 @@ from station.tui.words import MARKS, VERDICTS, Mark, dim, limit_bar, lines, mark
 NO_RESULT = "No result yet: F9 solves what was captured. On 5, Enter shows older ones."
 BAR_CELLS, NAME_CELLS = 12, 27
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
-Row = tuple[tuple[Content, ...], str]
-"""A row of the table of checks, and what Enter tells of it."""
+Row = tuple[tuple[Content, ...], str, Word]
+"""A row of the table of checks, and what Enter tells of it: what was found, and the word for it."""
 
 
 def verdict_lines(result: Result) -> Content:
@@ -106,22 +108,25 @@ def check_rows(result: Result, calibration: Calibration) -> list[Row]:
     for touch in calibration.verification:
         sigmas, name = touch_sigmas(touch), f"touch, corner {touch.corner}"
         kind: Mark = "done" if agrees(touch) else "failed"
-        rows.append(_row(kind, name, f"{sigmas:.1f} σ", sigmas, LIMIT_SIGMAS, "≤ 3.0 σ", touch_text(touch)))
+        row = _row(kind, name, f"{sigmas:.1f} σ", sigmas, LIMIT_SIGMAS, "≤ 3.0 σ")
+        rows.append((row, touch_text(touch), word_of("touch test")))
     for entry in reversed(result.state.drift if result.installed else ()):
         kind = "failed" if not entry.passed else "look" if entry.trend is not None else "done"
         name = time.strftime("drift check %d %b", time.localtime(entry.wall_s))
         value = f"{1000 * float(np.linalg.norm(entry.shift[:3])):.2f} mm"
-        rows.append(_row(kind, name, value, entry.statistic, entry.threshold, text=entry.advice))
+        row = _row(kind, name, value, entry.statistic, entry.threshold)
+        rows.append((row, entry.advice, word_of("drift check")))
     return rows
 
 
 def _gate_row(gate: Gate) -> Row:
     kind: Mark = "failed" if not gate.passed else "look" if gate.narrow else "done"
     name = gate.title.partition(" (")[0]
+    word = words_of_gates().get(gate.name, word_of("gate"))  # a file may tell a gate of a later version
     if gate.sense is None:
-        return _row(kind, name, text=gate.text)
+        return _row(kind, name), gate.text, word
     limit = f"{gate.sense} {gate.shown(gate.limit)}"
-    return _row(kind, name, gate.shown(gate.value), gate.value, gate.limit, limit, gate.text)
+    return _row(kind, name, gate.shown(gate.value), gate.value, gate.limit, limit), gate.text, word
 
 
 def _row(
@@ -131,9 +136,8 @@ def _row(
     value: float | None = None,
     limit: float | None = None,
     limit_text: str = "",
-    text: str = "",
-) -> Row:
-    """Make a row: mark, name, value, bar, limit."""
+) -> tuple[Content, ...]:
+    """Make the cells of a row: mark and name, value, bar, limit."""
     colour = MARKS[kind][1]
     bar = Content() if value is None or limit is None else limit_bar(value, limit, BAR_CELLS, colour)
     style = "bold $strong" if kind in ("failed", "look") else "$foreground"
@@ -142,19 +146,24 @@ def _row(
         Content.styled(shown, "bold $strong"),
         bar,
         dim(limit_text),
-    ), text
+    )
 
 
 def evidence(result: Result, calibration: Calibration) -> Content:
     """Write what installing changes, the camera's pose, and the views."""
-    sections = {
+    return Content("\n\n").join(
+        lines(Content.styled(title, "bold $accent"), *rows)
+        for title, rows in evidence_sections(result, calibration).items()
+    )
+
+
+def evidence_sections(result: Result, calibration: Calibration) -> dict[str, list[Content]]:
+    """Make the sections of the evidence, by their titles."""
+    return {
         "Change": change_lines(result, calibration),
         "Camera pose": pose_lines(calibration),
         "Views": view_lines(calibration),
     }
-    return Content("\n\n").join(
-        lines(Content.styled(title, "bold $accent"), *rows) for title, rows in sections.items()
-    )
 
 
 def change_lines(result: Result, calibration: Calibration) -> list[Content]:
@@ -190,6 +199,16 @@ def view_lines(calibration: Calibration) -> list[Content]:
     return [Content(noise_text(calibration)), *(mark("look", text) for text in rejected)]
 
 
+class Evidence(VerticalScroll):
+    """Texts of the result to scroll through; Enter explains their words."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("enter", "screen.explain_words", "Words", show=False)]
+
+    def __init__(self) -> None:
+        super().__init__(id="evidence-box", classes="panel")
+        self.border_title, self.border_subtitle = "Evidence", "Tab, Enter: its words"
+
+
 class ResultScreen(StationScreen):
     """The newest calibration, or the one picked from the sessions."""
 
@@ -208,9 +227,9 @@ class ResultScreen(StationScreen):
     def body(self) -> ComposeResult:
         yield Static(NO_RESULT, id="verdict")
         with Horizontal(id="result"):
-            with Box("Checks", id="checks-box", below="Enter tells why"):
+            with Box("Checks", id="checks-box", below="Enter explains"):
                 yield Rows("check", "value", "", "limit", id="checks")
-            with VerticalScroll(id="evidence-box", classes="panel"):
+            with Evidence():
                 yield Static(id="evidence")
 
     def show(self, known: Known) -> None:
@@ -230,11 +249,20 @@ class ResultScreen(StationScreen):
         self.query_one("#result").display = calibration is not None
         if result is not None and calibration is not None:
             self._rows = check_rows(result, calibration)
-            self.table.show([row for row, _ in self._rows])
+            self.table.show([cells for cells, _, _ in self._rows])
             self.query_one("#evidence", Static).update(evidence(result, calibration))
 
     def on_data_table_row_selected(self, event: DataTable.RowSelected) -> None:
-        self.notify(self._rows[event.cursor_row][1], timeout=10, markup=False)
+        """Explain a check at Enter."""
+        _, text, word = self._rows[event.cursor_row]
+        self.app.push_screen(Explained(word.term, text, [word]))
+
+    def action_explain_words(self) -> None:
+        """Explain the words of the verdict and of the evidence."""
+        result = self.known.result
+        if result is not None and result.calibration is not None:
+            told = f"{verdict_lines(result)}\n{evidence(result, result.calibration)}"
+            self.app.push_screen(Explained("The words of this result", "", words_in(told)))
 
     def action_report(self) -> None:
         result = self.known.result

@@ -77,9 +77,7 @@ class StationScreen(Framed[None]):
     """A screen below the frame; each has its own `body`."""
 
     AUTO_FOCUS = "Rows, #checklist-scroll, #log"
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("f1", "app.command_palette", "Help", tooltip="Every action and its key, to search in")
-    ]
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("f1", "app.help", "Help")]
     TIP: ClassVar[str] = ""
     """Purpose in a few words."""
 

@@ -120,6 +120,12 @@ class Known:
         return lease.holder
 
     @property
+    def has_control(self) -> bool:
+        """This screen has control."""
+        holder = None if self.live is None else self.live.lease.client_id
+        return holder is not None and holder == self.own_id
+
+    @property
     def works(self) -> bool:
         """The arm works, or may: nothing else should cost the daemon time."""
         return self.live is not None and self.live.state in RUNNING

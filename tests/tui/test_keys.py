@@ -13,6 +13,7 @@ from station.cell.status import StationState
 from station.protocol import verbs
 from station.tui.dialogs import Confirm, ConfirmFinish, ConfirmMotion, JobScreen, Reason
 from station.tui.frame import Question
+from station.tui.help import action_entries
 from tests.tui.conftest import (
     SUMMARY,
     FakeLink,
@@ -57,22 +58,20 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
         await until(pilot, lambda: pilot.app.screen.query_one("#yes").region)
         await pilot.press("f8")  # as STOP's, it works in a question, and leaves it answerable
         await until(pilot, lambda: "acknowledge" in link.verbs)
-        asked = {command.title for command in pilot.app.get_system_commands(pilot.app.screen)}
-        assert asked == {"Theme", "STOP (f12)", "Acknowledge (f8)"}, "others would take the question away"
+        offered = {entry.action for entry in action_entries(pilot.app, pilot.app.screen)}
+        assert offered == {"stop", "acknowledge"}, "others would take the question away"
         await pilot.click("#yes")
         await until(pilot, lambda: verbs.Go("t-1", SUMMARY.approval_sha256) in link.asked)
         await until(pilot, lambda: pilot.app.current_mode == "capture")  # where the work is watched
 
 
 @pytest.mark.parametrize("why", ["STOP", "expired"])
-async def test_a_question_below_the_palette_closes_once_the_palette_is_closed(
-    link: FakeLink, why: str
-) -> None:
+async def test_a_question_below_help_closes_once_help_is_closed(link: FakeLink, why: str) -> None:
     async with opened(link, notifications=True) as pilot:
         await pilot.press("f5")
         await until(pilot, lambda: pilot.app.screen.query("#yes"))
         question = pilot.app.screen
-        await pilot.press("ctrl+p")
+        await pilot.press("f1")
         await until(pilot, lambda: pilot.app.screen is not question)
         for reason in ("STOP by ben", "STOP by anna"):  # each is drawn
             link.show(idle(StationState.STOPPED, reason) if why == "STOP" else idle(reason=reason))
@@ -125,39 +124,6 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(link: Fa
             await until(pilot, lambda request=request: request in link.asked)
 
 
-async def test_the_palette_names_the_screen_s_own_keys_too_and_stop_works_in_it(link: FakeLink) -> None:
-    async with opened(link) as pilot:
-        await pilot.press("2")
-        await pilot.pause()
-        named = {command.title: command for command in pilot.app.get_system_commands(pilot.app.screen)}
-        assert {"Retake (r)", "Pause (f6)", "STOP (f12)"} <= set(named)
-        assert {title for title in named if not title.endswith(")")} == {"Theme"}, (
-            "others hide STOP, or leave"
-        )
-        named["Skip (s)"].callback()
-        await until(pilot, lambda: verbs.Skip(0) in link.asked)
-        await pilot.press("f1")
-        await pilot.pause()
-        await pilot.press("x", "f12")
-        await until(pilot, lambda: "stop" in link.verbs)
-
-
-async def test_help_and_enter_do_nothing_that_a_person_did_not_choose(link: FakeLink) -> None:
-    """F12, F1, Enter left STOP: what help shows first is chosen by Enter alone."""
-    link.show(idle(StationState.STOPPED))
-    async with opened(link) as pilot:
-        await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
-        before = list(link.verbs)
-        await pilot.press("f1")
-        palette = pilot.app.screen
-        await until(pilot, lambda: palette.query_one("CommandList").option_count > 5)
-        first = str(palette.query_one("CommandList").get_option_at_index(0).prompt)
-        assert first.startswith("Theme")
-        await pilot.press("enter")
-        await pilot.pause()
-        assert link.verbs == before
-
-
 def kinds_of(kind: type[Question[Any]]) -> set[type[Question[Any]]]:
     """Every kind of question that the screens may ask."""
     direct = set(kind.__subclasses__())
@@ -170,8 +136,8 @@ MADE: dict[str, Callable[[], Question[Any]]] = {
     "ConfirmMotion": lambda: ConfirmMotion(SUMMARY),
     "Reason": lambda: Reason("Why?", "Enter does it."),
 }
-NOTHING_TO_APPROVE = {"JobScreen", "TouchCorners"}
-"""Work that a person began, and positions that are read."""
+NOTHING_TO_APPROVE = {"JobScreen", "TouchCorners", "Explained", "Help"}
+"""Work that a person began, positions that are read, texts, and help, which has tests of its own."""
 
 
 async def test_enter_alone_says_yes_to_no_question(link: FakeLink) -> None:

@@ -301,8 +301,8 @@ async def test_a_person_at_a_terminal_approves_when_the_configuration_lets_them(
         else:
             await anna.request("go", token=summary["token"])
             status = served.rig.session.store.status
-            assert any("at pts/3" in event.text for event in status.events)
-            assert status.lease.holder == f"{ME} on pts/3 (pid {os.getpid()})"
+            assert any("at terminal window 3" in event.text for event in status.events)
+            assert status.lease.holder == f"{ME}, terminal window 3"
     await served.control.close()
 
 
@@ -339,15 +339,16 @@ async def test_stop_without_a_connection_is_named_by_the_persons_terminal(served
     assert not dispatcher.latched
     await dispatcher.stop_by_client(Peer(0, 5, os.getuid()))
     assert dispatcher.latched and dispatcher.motion is ArmMotion.RESTS  # what `station stop` is told
-    assert f"uid {os.getuid()} (pid 5)" in served.rig.session.store.status.reason  # it asked nothing before
+    # It asked nothing before.
+    assert f"user {os.getuid()}, process 5" in served.rig.session.store.status.reason
     await served.rig.session.acknowledge("anna")
     dispatcher.stop_by_datagram(Peer(0, 5, os.getuid()))
     await until(lambda: served.rig.session.store.state is StationState.STOPPED)
-    assert f"uid {os.getuid()} on pts/3 (pid 5)" in served.rig.session.store.status.reason
+    assert f"user {os.getuid()}, terminal window 3" in served.rig.session.store.status.reason
 
 
 def test_an_approval_in_a_screen_is_told_by_the_persons_own_terminal() -> None:
     user = os.getuid()
     see = {5: Process(user, 77, "pts/9", parent=4), 4: Process(user, 70, "pts/3")}.get
     rule = ApprovalRule(ApprovalConfig(), False, see)
-    assert rule.by_person(Peer(1, 5, user, began_ticks=77), "A move") == "at pts/3"
+    assert rule.by_person(Peer(1, 5, user, began_ticks=77), "A move") == "at terminal window 3"

@@ -44,6 +44,8 @@ from station.tui.words import MARKS, VERDICTS, Mark, dim, limit_bar, lines, mark
 NO_RESULT = "No result yet: F9 solves what was captured. On 5, Enter shows older ones."
 BAR_CELLS, NAME_CELLS = 12, 27
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
+RESULT_GROUPS = ("Result", "Installed")
+"""Groups of words that stand first where the words of a result are explained."""
 Row = tuple[tuple[Content, ...], str, Word]
 """A row of the table of checks, and what Enter tells of it: what was found, and the word for it."""
 
@@ -262,7 +264,8 @@ class ResultScreen(StationScreen):
         result = self.known.result
         if result is not None and result.calibration is not None:
             told = f"{verdict_lines(result)}\n{evidence(result, result.calibration)}"
-            self.app.push_screen(Explained("The words of this result", "", words_in(told)))
+            used = sorted(words_in(told), key=lambda word: word.group not in RESULT_GROUPS)
+            self.app.push_screen(Explained("The words of this result", "", used))
 
     def action_report(self) -> None:
         result = self.known.result

@@ -230,7 +230,7 @@ async def test_a_named_service_approves_by_the_hash_of_plan_and_cell_and_is_writ
     recording = open_recording(Path(session.store.status.session.recording))
     recorded = [event.detail for event in recording.events() if "approved by" in event.detail]
     for texts in (told, recorded):
-        assert len(texts) == 1 and ME in texts[0] and f"pid {os.getpid()}" in texts[0]
+        assert len(texts) == 1 and ME in texts[0] and f"process {os.getpid()}" in texts[0]
         assert "service" in texts[0] and sha256[:12] in texts[0]
     await served.control.close()
 

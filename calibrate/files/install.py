@@ -77,6 +77,7 @@ def install(
     camera: str = "",
     override: str = "",
     max_age_days: float | None = None,
+    by: str = "",
 ) -> InstalledVersion:
     """Make the calibration file `path` the current one of its camera.
 
@@ -84,7 +85,7 @@ def install(
     imported, whatever the override. `camera`: its name in the cell; empty: as in the file.
     `override`: a person's reason to install although a gate failed or robot or camera differ; it goes into
     the file. `max_age_days`: age of the last proof from which it is in doubt; None: the rule of the one
-    before, 0: no rule.
+    before, 0: no rule. `by`: who installs it, for the log and the file; empty: the user of this process.
 
     Raises InstallError (also as exit code 4 for a gate) or CalibrationFileError.
     """
@@ -118,11 +119,11 @@ def install(
             )
         if overridden:
             _require_words(override)
-            taken = Override(override.strip(), who(), overridden)
+            taken = Override(override.strip(), by or who(), overridden)
             calibration = msgspec.structs.replace(calibration, override=taken)
         change = "" if _is_withdrawn(folder) else change_text(before, calibration)
-        validity = _first_validity(calibration, _max_age_days(folder, max_age_days))
-        return add_version(folder, calibration, "install", validity, change, override.strip())
+        validity = _first_validity(calibration, _max_age_days(folder, max_age_days), by or who())
+        return add_version(folder, calibration, "install", validity, change, override.strip(), by=by)
 
 
 def _is_withdrawn(folder: Path) -> bool:
@@ -134,7 +135,7 @@ def _is_withdrawn(folder: Path) -> bool:
     return read_validity_log(folder).of(number).state is ValidityState.WITHDRAWN
 
 
-def _first_validity(calibration: Calibration, max_age_days: float | None) -> Validity:
+def _first_validity(calibration: Calibration, max_age_days: float | None, by: str) -> Validity:
     """Choose the validity of a new installation: valid, unless it is imported or overridden."""
     state, reason = ValidityState.UNVERIFIED, ValidityReason("installed")
     if calibration.source == "imported":
@@ -146,7 +147,7 @@ def _first_validity(calibration: Calibration, max_age_days: float | None) -> Val
         state = ValidityState.VALID
     recorded_ns = calibration.provenance.recorded_wall_ns
     proven = time_text(datetime.fromtimestamp(recorded_ns / 1e9, UTC)) if recorded_ns else calibration.created
-    return Validity(0, state, time_text(), reason, who(), proven, max_age_days)
+    return Validity(0, state, time_text(), reason, by, proven, max_age_days)
 
 
 def _max_age_days(folder: Path, asked: float | None) -> float | None:
@@ -164,12 +165,16 @@ def rollback(
     *,
     camera: str = MAIN_CAMERA,
     override: str = "",
+    by: str = "",
+    seen: int | None = None,
 ) -> InstalledVersion:
     """Make the calibration before the current one, or version `to`, the current one again.
 
     It is unverified until a check passes, or in doubt if it was before. `reason`: may be empty. `override`: a
     person's reason why version `to` may be used although a damaged line of the log may have withdrawn it
-    (`log-damaged`); it goes into the log. Raises InstallError.
+    (`log-damaged`); it goes into the log. `by`: who asks for it, for the log; empty: the user of this
+    process. `seen`: the version that a person saw installed. Raises InstallError: `other-version` where
+    another one is by now.
     """
     for given in (reason, override):
         if given.strip():
@@ -180,6 +185,8 @@ def rollback(
     if to is None:
         current_version(folder)  # raises first, so that no folder is created in vain
     with locked(folder):
+        if seen is not None:
+            _require_current(folder, seen)
         known = installed_versions(root, camera)
         if to is None:
             target = before_current(known, read_log(root, camera))
@@ -196,16 +203,26 @@ def rollback(
         change = change_text(before, target.calibration)
         recorded = read_validity_log(folder).of(target.number)
         was = replace(recorded, max_age_days=_max_age_days(folder, None))
-        validity = _validity_again(was, target.current, override.strip())
+        validity = _validity_again(was, target.current, override.strip(), by or who())
         said = reason or override.strip()
-        return make_current(folder, replace(target, validity=validity), "rollback", change, said)
+        return make_current(folder, replace(target, validity=validity), "rollback", change, said, by=by)
 
 
-def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Validity:
-    """Take the installed calibration out of use. Raises InstallError, also for an empty reason."""
+def withdraw(
+    root: Path | None,
+    reason: str,
+    *,
+    camera: str = MAIN_CAMERA,
+    by: str = "",
+    seen: int | None = None,
+) -> Validity:
+    """Take the installed calibration out of use. `by`, `seen`: as for `rollback`.
+
+    Raises InstallError, also for an empty reason.
+    """
     _require_words(reason)
     cause = ValidityReason("withdrawn", reason.strip())
-    return set_validity(root, ValidityState.WITHDRAWN, cause, camera=camera)
+    return set_validity(root, ValidityState.WITHDRAWN, cause, camera=camera, version=seen, by=by)
 
 
 def undo_line(root: Path | None = None, camera: str = MAIN_CAMERA) -> str:
@@ -221,7 +238,7 @@ def _line(root: Path | None, camera: str, *words: str) -> str:
     return shlex.join(["calibrate", *words, *where, *named])
 
 
-def _validity_again(was: Validity, current: bool, override: str) -> Validity:
+def _validity_again(was: Validity, current: bool, override: str, by: str) -> Validity:
     """Choose the validity of a version after a rollback: it was not checked while it was not current."""
     if was.reason.code == LOG_DAMAGED and override:
         reason = ValidityReason("override", f"In spite of a damaged log: {override}")
@@ -229,7 +246,7 @@ def _validity_again(was: Validity, current: bool, override: str) -> Validity:
         return was
     else:
         reason = ValidityReason("rolled-back", "Rolled back to. Run a drift check.")
-    return replace(was, state=ValidityState.UNVERIFIED, since=time_text(), reason=reason, who=who())
+    return replace(was, state=ValidityState.UNVERIFIED, since=time_text(), reason=reason, who=by)
 
 
 def set_validity(
@@ -239,12 +256,14 @@ def set_validity(
     *,
     camera: str = MAIN_CAMERA,
     version: int | None = None,
+    by: str = "",
 ) -> Validity:
     """Record that the installed calibration of `camera` is valid, unverified, in doubt or withdrawn, and why.
 
-    `version`: the one that was judged. Raises InstallError: `other-version` where another one is installed by
-    now, `nothing-installed` where none is. VALID makes now the time of the last proof. A doubt by
-    `log-damaged` stays unless it is withdrawn: a person ends it with `rollback`.
+    `version`: the one that was judged. `by`: who says so; empty: the user of this process. VALID makes now
+    the time of the last proof. A doubt by `log-damaged` stays unless it is withdrawn: a person ends it with
+    `rollback`. Raises InstallError: `other-version` where another one is installed by now,
+    `nothing-installed` where none is.
     """
     require_choice("state", state, ValidityState)
     state, now = ValidityState(state), time_text()
@@ -254,7 +273,7 @@ def set_validity(
             return before
         since = before.since if before.state is state else now
         verified = now if state is ValidityState.VALID else before.verified
-        return replace(before, state=state, since=since, reason=reason, who=who(), verified=verified)
+        return replace(before, state=state, since=since, reason=reason, who=by or who(), verified=verified)
 
     return _change_validity(root, camera, version, change)
 
@@ -281,14 +300,20 @@ def _change_validity(
     folder = calibrations_folder(root, camera)
     current_version(folder)  # raises first, so that no folder is created in vain
     with locked(folder):
-        number, _ = current_version(folder)
-        if version not in (None, number):
-            raise InstallError("other-version", folder=folder, version=number, judged=version)
+        number = current_version(folder)[0] if version is None else _require_current(folder, version)
         before = read_validity_log(folder).of(number)
         after = change(before)
         if after != before:
             append_to_log(folder, after, version_numbers(folder))
     return after.at(datetime.now(UTC))
+
+
+def _require_current(folder: Path, seen: int) -> int:
+    """Return the number of the installed version. InstallError where it is another than a person saw."""
+    number, _ = current_version(folder)
+    if number != seen:
+        raise InstallError("other-version", folder=folder, version=number, judged=seen)
+    return number
 
 
 def reason_problem(reason: str) -> str:

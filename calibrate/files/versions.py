@@ -150,7 +150,14 @@ def read_log(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[LogEnt
 
 
 def add_version(
-    folder: Path, calibration: Calibration, action: Action, validity: Validity, change: str, reason: str = ""
+    folder: Path,
+    calibration: Calibration,
+    action: Action,
+    validity: Validity,
+    change: str,
+    reason: str = "",
+    *,
+    by: str = "",
 ) -> InstalledVersion:
     """Write a new version, make it the current one and log it. Call inside `locked` only.
 
@@ -164,7 +171,7 @@ def add_version(
         share(path)
         decode_calibration(read_bounded(path), str(path))
         version = InstalledVersion(number, path, True, calibration, replace(validity, version=number))
-        return make_current(folder, version, action, change, reason)
+        return make_current(folder, version, action, change, reason, by=by)
     except BaseException:
         if current_name(folder) != path.name:
             path.unlink(missing_ok=True)
@@ -178,10 +185,20 @@ def version_numbers(folder: Path) -> list[int]:
 
 
 def make_current(
-    folder: Path, version: InstalledVersion, action: Action, change: str, reason: str = ""
+    folder: Path,
+    version: InstalledVersion,
+    action: Action,
+    change: str,
+    reason: str = "",
+    *,
+    by: str = "",
 ) -> InstalledVersion:
-    """Switch to a version and log it. Call inside `locked` only. InstallError where it reads back wrong."""
-    entry = LogEntry(time_text(), action, version.number, who(), change, reason, _current_number(folder))
+    """Switch to a version and log it. Call inside `locked` only. InstallError where it reads back wrong.
+
+    `by`: who asked for it; empty: the user of this process.
+    """
+    replaced = _current_number(folder)
+    entry = LogEntry(time_text(), action, version.number, by or who(), change, reason, replaced)
     line = asdict(version.validity) | {"switch": entry}
     append_to_log(folder, line, version_numbers(folder))  # before the switch, so that it is never missing
     _switch(folder, version.path.name, read_bounded(version.path))
@@ -260,11 +277,13 @@ def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
 
 
 def note_installed(
-    root: Path | None, tested: Calibration, touches: Sequence[Touch]
+    root: Path | None, tested: Calibration, touches: Sequence[Touch], *, by: str = ""
 ) -> InstalledVersion | None:
     """Add touch tests to the installed calibration, as a new version, because versions never change.
 
     A failed corner puts it in doubt. None where what is installed is not of the same solve as `tested`.
+    `by`: who tested it; empty: the user of this process.
+
     Raises InstallError where the folder cannot be written.
     """
     folder = calibrations_folder(root, tested.camera_name)
@@ -285,8 +304,8 @@ def note_installed(
         )
         now = datetime.now(UTC)
         passed = all(map(agrees, touches))
-        validity = before.after_check(reason, passed, not passed, now, who())
-        return add_version(folder, calibration, "verify", validity, found)
+        validity = before.after_check(reason, passed, not passed, now, by or who())
+        return add_version(folder, calibration, "verify", validity, found, by=by)
 
 
 def _with_touches(calibration: Calibration, touches: Sequence[Touch]) -> Calibration:

@@ -267,6 +267,17 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
         return CHECK_VIEWS if self.check else FEWEST_BY_HAND
 
 
+class ResultsStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What is installed for the cell's camera, looked at once a second, whoever changes it."""
+
+    installed: int | None = None
+    """Installed version; None: nothing is installed."""
+    validity: str = ""
+    """Its validity now: valid, unverified, in-doubt, withdrawn; empty: nothing is installed."""
+    changes: int = 0
+    """Changes of sessions and installed calibrations that were seen: at another number ask for them again."""
+
+
 class LeaseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     holder: str = ""
     """Client that has control, as 'anna, console 1'; empty: none"""
@@ -337,6 +348,7 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     or a plan came after it."""
     estimate: EstimateStatus = EstimateStatus()
     guidance: GuidanceStatus = GuidanceStatus()
+    results: ResultsStatus = ResultsStatus()
     lease: LeaseStatus = LeaseStatus()
     events: tuple[Event, ...] = ()
     """Newest events, at most 100."""

@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass
-from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.check.board_now import BoardNow, found_points, locate_board, offset_covariance
 from calibrate.check.same_cell import require_same_cell
-from calibrate.files.calibration import Calibration, read_calibration
-from calibrate.files.folders import VERSION_NAME
+from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch
 from calibrate.files.validity import time_text
-from calibrate.files.versions import note_in_file, note_installed, who
+from calibrate.files.versions import who
 from calibrate.views.corners import Corners
 from calibrate.views.view_set import BoardView
 from recordings.geometry import Array, base_from_flange, inverse, transform_points
@@ -27,9 +26,11 @@ from station.cell.errors import RefusedError
 from station.cell.status import StationStatus
 from station.operate.next_step import after_touches
 from station.protocol.client import Client
-from station.protocol.verbs import Observe
+from station.protocol.verbs import NoteTouches, Observe
 
 LOOK_S = 30.0
+NOTE_S = 60.0
+"""Longest wait until touch tests are written, on a busy computer."""
 _TOUCHING_M, _BESIDE_M = 0.01, 0.05
 """Largest distance of the tip from the board, and from the corner, for a touch."""
 _SHORTEST_M = 0.01
@@ -48,9 +49,8 @@ class SeenBoard:
     """How `tip_m` is known."""
 
 
-async def see_board(link: Client, status: StationStatus, file: Path) -> SeenBoard:
-    """Take an image; find the board by the calibration in `file`. Raises StationError, CalibrationError."""
-    calibration = read_calibration(file)
+async def see_board(link: Client, status: StationStatus, calibration: Calibration) -> SeenBoard:
+    """Take an image; find the board by the calibration. Raises StationError, CalibrationError."""
     seen = await link.call(Observe(calibration.board), timeout_s=LOOK_S)
     robot, camera = status.robot.identity, status.camera.identity
     if robot is None or camera is None:
@@ -118,15 +118,15 @@ def _mm(metres: Array) -> tuple[float, float]:
     return round(1000 * float(metres[0]), 3), round(1000 * float(metres[1]), 3)
 
 
-def note_touches(root: Path, file: Path, touches: list[Touch]) -> str:
-    """Save touch tests in the file and in the installed calibration of the same solve; describe the result.
+async def note_touches(link: Client, session: str, touches: list[Touch]) -> str:
+    """Let the daemon write touch tests; describe what it wrote, and what to do next.
 
-    `file` may be an installed version: these never change. Raises CalibrationError, OSError.
+    `session`: in whose calibration; empty: in the installed one. Raises StationError.
     """
-    kept = VERSION_NAME.fullmatch(file.name)
-    noted = read_calibration(file) if kept else note_in_file(file, touches)
-    where = [] if kept else [f"into {file}"]
-    if made := note_installed(root, noted, touches):
-        where.append(f"into the installed calibration, now version {made.number}")
+    plain = [msgspec.to_builtins(touch) for touch in touches]
+    noted = await link.call(NoteTouches(session, plain), timeout_s=NOTE_S)
+    where = [f"into {noted.file}"] if noted.file else []
+    if noted.version is not None:
+        where.append(f"into the installed calibration, now version {noted.version}")
     said = " and ".join(where) or "nowhere: another one is installed by now"
     return f"Written {said}. {after_touches(touches)}."

@@ -26,6 +26,7 @@ from station.protocol.states import LATCHED, RESTING, RUNNING
 R = TypeVar("R", covariant=True)
 _ANY = frozenset(S)
 _LOADING = frozenset({S.IDLE, S.DISCONNECTED})
+_AT_REST = _ANY - RUNNING
 
 
 class Needs(StrEnum):
@@ -151,6 +152,29 @@ class Check(msgspec.Struct, frozen=True):
     state: Literal["ok", "warning", "failed", "skipped"]
     text: str
     remedy: str = ""
+
+
+class ResultData(msgspec.Struct, frozen=True, omit_defaults=True):
+    result: Any = None
+    """A `Result` of `station.protocol.results`, as plain data; None: there is none yet."""
+
+
+class SessionsData(msgspec.Struct, frozen=True):
+    sessions: list[Any]
+    """`Kept` of `station.protocol.results`, as plain data, newest first."""
+
+
+class InstalledVersion(msgspec.Struct, frozen=True):
+    version: int
+    validity: str
+    """valid, unverified, in-doubt, withdrawn"""
+
+
+class TouchesNoted(msgspec.Struct, frozen=True, omit_defaults=True):
+    file: str = ""
+    """Calibration file into which they were written; empty: an installed version, which never changes."""
+    version: int | None = None
+    """New installed version that has them; None: another calibration is installed by now."""
 
 
 PLANNED_ELSEWHERE = "planned-elsewhere"
@@ -338,6 +362,73 @@ class Doctor(Verb[list[Check]], frozen=True):
     """Run the preflight check."""
 
     control = False
+
+
+class GetResult(Verb[ResultData], frozen=True):
+    """Return the calibration made from a session, beside what is installed.
+
+    Without a session it is that of the one just recorded. Before any, and after a drift check, it is that of
+    what is installed.
+    """
+
+    wire = "result"
+    control = False
+    session: str = ""
+    """Name of the session, which is that of its folder."""
+
+
+class GetSessions(Verb[SessionsData], frozen=True):
+    """Return the recorded sessions and what became of each, newest first."""
+
+    wire = "sessions"
+    control = False
+
+
+class GetInstalled(Verb[InstalledVersion], frozen=True):
+    """Return the installed version, once its file was read; an error where there is none or it is damaged."""
+
+    wire = "installed"
+    control = False
+
+
+class Install(Verb[InstalledVersion], frozen=True):
+    """Make the calibration of a session the installed one; with a reason to override only by a person."""
+
+    states = _AT_REST
+    spoken = "installing"
+    session: str
+    """Empty: the installed version itself, once more."""
+    override: str = ""
+    """A person's reason to install in spite of a refusal, kept in the file."""
+
+
+class Rollback(Verb[InstalledVersion], frozen=True):
+    """Make the calibration before the installed one the installed one again."""
+
+    states = _AT_REST
+    spoken = "going back to the calibration before"
+    seen: int
+    """Version that the person saw installed; refused where it is another one by now."""
+
+
+class Withdraw(Verb[InstalledVersion], frozen=True):
+    """Take the installed calibration out of use."""
+
+    reason: str
+    """Why it must not be used; kept, and told to programs."""
+    seen: int
+    """Version that the person saw installed; refused where it is another one by now."""
+
+
+class NoteTouches(Verb[TouchesNoted], frozen=True):
+    """Write touch tests into the calibration of a session, and into the installed one of the same solve."""
+
+    states = _AT_REST
+    spoken = "writing touch tests"
+    session: str
+    """Empty: into the installed version."""
+    touches: list[Any]
+    """Each as `verification` in a calibration file."""
 
 
 VERBS: dict[str, type[Verb[object]]] = {kind.verb(): kind for kind in Verb.__subclasses__()}

@@ -149,7 +149,33 @@ class SessionDispatcher:
                 return await session.previews.observe(verb.tag)
             case verbs.Doctor():
                 return await checklist(context, session.devices.troubles)
+            case verbs.GetResult():
+                return await session.results.result(verb.session)
+            case verbs.GetSessions():
+                return await session.results.sessions()
+            case verbs.GetInstalled():
+                return await session.results.installed()
+            case _:
+                return await self._change_results(caller, verb)
         return None
+
+    async def _change_results(self, caller: Peer, verb: Verb[object]) -> object:
+        """Install, undo, withdraw or note touch tests, to its end also if the client disconnects."""
+        results, by = self._session.results, await self._named(caller)
+        match verb:
+            case verbs.Install():
+                if verb.override:
+                    self._rule.by_person(by, "Installing in spite of a refusal")
+                work: Coroutine[object, object, object] = results.install(verb, by.user)
+            case verbs.Rollback():
+                work = results.rollback(verb, by.user)
+            case verbs.Withdraw():
+                work = results.withdraw(verb, by.user)
+            case verbs.NoteTouches():
+                work = results.note_touches(verb, by.user)
+            case _:
+                return None
+        return await self._to_the_end(work)
 
     async def _approval(self, caller: Peer, sha256: str) -> Approval:
         """Check that this client may approve what is offered. RefusedError where it may not."""

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from recordings.errors import RecordingError
 from station.analysis.pool import Workers
+from station.analysis.result_files import start_reader
 from station.analysis.worker import start_worker
 from station.cell.errors import RefusedError, RobotError, StationError
 from station.cell.layout import approval_sha256
@@ -39,6 +40,7 @@ from station.session.motion import ApprovalManager, offered, session_motion
 from station.session.predictor import Predictor
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue, refused
+from station.session.results import Results
 from station.session.run import Run
 from station.session.stop_move import stop_motion
 from station.session.supervisor import SessionSupervisor
@@ -72,6 +74,7 @@ class Session:
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context, self.previews)
+        self.results = Results(config, cell.source, root, self.store, Workers(start_reader))
         self._estimator = Estimator(self.context)
         self._predictor = Predictor(self.context)
         self._run: asyncio.Task[None] | None = None
@@ -101,7 +104,7 @@ class Session:
             self._enter_latched(left_latched)
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
-        watching = self.supervisor.run, self.supervisor.monitor.watch_files
+        watching = self.supervisor.run, self.supervisor.monitor.watch_files, self.results.watch
         figures = self._estimator.run, self._predictor.run
         loops = (*watching, self.latch.run, self.devices.run, *figures, self.freedrive.run)
         self._tasks = [asyncio.create_task(self.kept_going(loop)) for loop in loops]
@@ -162,6 +165,7 @@ class Session:
         for task in self._tasks:
             task.cancel()
         context.workers.close()
+        self.results.close()
         closing = asyncio.create_task(self.devices.close())
         _, left = await asyncio.wait({*self._tasks, closing}, timeout=CLOSE_DEVICES_S)
         if closing in left:

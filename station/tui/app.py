@@ -29,7 +29,6 @@ from station.tui.daemon_link import SILENT_S, DaemonApp, DaemonLink, TerminalWat
 from station.tui.dialogs import Confirm, ConfirmFinish, ConfirmMotion
 from station.tui.frame import Question
 from station.tui.help import Help
-from station.tui.installed import Marks, marks, read_result, read_sessions, solved_file, state_root
 from station.tui.jobs import check_drift, solve_session
 from station.tui.live_page import SIDE_PX, LivePageApp, news_of
 from station.tui.log_screen import LogScreen
@@ -41,7 +40,6 @@ from station.tui.stop_key import run_behind_stop_key
 from station.tui.task import DIGITS, STEPS, too_few
 from station.tui.widgets.preview import PreviewPane, sharp_widget
 
-LOOK_S = 2.0
 PREVIEW_PERIOD_S = 0.25
 LIVE_PERIOD_S = 0.1
 """Between two pictures for a browser while the arm rests."""
@@ -99,14 +97,14 @@ class StationApp(LivePageApp[None], DaemonApp):
         self.link = DaemonLink(self, client)
         self.terminal_watch = TerminalWatch(self.link)
         self._look = asyncio.Event()
-        self._marks: tuple[str, Marks] | None = None
-        """The shown file, and marks of all below the root, when they were read."""
+        self._asked: tuple[object, ...] | None = None
+        """What results and sessions depended on when they were asked for; None: they must be asked for."""
         self._greeted = False
 
     def on_mount(self) -> None:
         self.run_worker(self.link.follow(), group="follow", exit_on_error=False)
         self.fetch_previews()
-        self.follow_disk()
+        self.follow_results()
         self.terminal_watch.begin()
 
     def on_cursor_position(self, event: events.CursorPosition) -> None:
@@ -143,9 +141,11 @@ class StationApp(LivePageApp[None], DaemonApp):
             return
         self.known = replace(self.known, status=status, gone="", own_id=self.link.client.own_id)
         if before is None or before.session.recording != status.session.recording:
-            self.look_at_disk()
+            self.look_at_results()
+        elif not self.known.works and self._depends_on(status) != self._asked:
+            self._look.set()
         if before is not None and status.session.name not in ("", before.session.name):
-            self.result_path = ""  # another session began: what was looked at is no part of it
+            self.result_session = ""  # another session began: what was looked at is no part of it
         elif self.known.hand_guided and before is not None and _one_more(before.session, status.session):
             self.bell()
         if before is None:  # connected, perhaps to another daemon than before
@@ -162,36 +162,42 @@ class StationApp(LivePageApp[None], DaemonApp):
         if (checks := await self.link.ask(verbs.Doctor())) is not None:
             self.known = replace(self.known, checks=tuple(checks))
 
-    def watch_result_path(self) -> None:
-        self.look_at_disk()
+    def watch_result_session(self) -> None:
+        self.look_at_results()
 
-    def look_at_disk(self) -> None:
-        self._marks = None
+    def look_at_results(self) -> None:
+        """Ask for the result and the sessions, also while the arm works."""
+        self._asked = None
         self._look.set()
 
-    @work(group="disk", exit_on_error=False)
-    async def follow_disk(self) -> None:
-        """Look for what other programs solved or installed; a daemon at work is left in peace."""
-        while True:
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._look.wait(), LOOK_S)
-            asked = self._look.is_set()
-            self._look.clear()
-            if self.known.live is not None and (asked or not self.known.works):
-                await self.link.attempt(self._read_changed(self.known.live.session))
+    def _depends_on(self, status: StationStatus) -> tuple[object, ...]:
+        """List what the shown result and the list of sessions depend on, changes by other programs too."""
+        session = status.session
+        return (
+            self.result_session,
+            session.name,
+            session.recording,
+            session.check,
+            status.checked.recording,
+            status.results,
+        )
 
-    async def _read_changed(self, session: SessionStatus) -> None:
-        client, path = self.link.client, self.result_path
-        if not path and client.root is not None:
-            path = await asyncio.to_thread(solved_file, session, client.root, client.camera)
-        root = state_root(path) if path else client.root
-        if root is None or (found := (path, await asyncio.to_thread(marks, root))) == self._marks:
-            return
-        self._marks = found
-        result = await asyncio.to_thread(read_result, path) if path else None
+    @work(group="results", exit_on_error=False)
+    async def follow_results(self) -> None:
+        """Ask for what was solved, installed or recorded, by whomever; a daemon at work is left in peace."""
+        while True:
+            await self._look.wait()
+            self._look.clear()
+            live = self.known.live
+            if live is not None and (self._asked is None or not self.known.works):
+                self._asked = self._depends_on(live)
+                await self.link.attempt(self._read_results())
+
+    async def _read_results(self) -> None:
+        result = await self.link.result(self.result_session)
         self.known = replace(self.known, result=result)
-        kept = await asyncio.to_thread(read_sessions, client.root or root, client.camera)
-        self.known = replace(self.known, sessions=kept)
+        sessions = await self.link.sessions()
+        self.known = replace(self.known, sessions=sessions)
 
     # --- what the screens ask for by a key ---
 

@@ -18,6 +18,7 @@ from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
 from station.protocol import verbs
 from station.protocol.client import ANSWER_S, Client
+from station.protocol.results import Kept, Result
 from station.protocol.verbs import Release, Verb
 from station.tui.task import Known
 from station.tui.themes import ThemedApp
@@ -31,12 +32,20 @@ _PATIENT_S = 7 * 86400.0
 STATUS_PERIOD_S = 0.25
 """Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
 RECONNECT_S = 1.0
+READ_S = 60.0
+LIST_S = 180.0
+"""Longest waits for a result and for the list of sessions: on a busy computer reading takes its time."""
+CHANGE_S = 120.0
+"""Longest wait for an installation, which may wait for a list that is being read."""
 GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
 BUSY: dict[type[Verb[Any]], str] = {
     verbs.MakePlan: "Planning …",
     verbs.Prepare: "Checking the path …",
     verbs.Observe: "Looking for the board …",
+    verbs.Install: "Installing …",
+    verbs.Rollback: "Going back …",
+    verbs.Withdraw: "Taking it out of use …",
 }
 """Words for a verb that takes seconds, or minutes on a busy computer. Others are answered at once."""
 
@@ -45,16 +54,16 @@ class DaemonApp(ThemedApp[None]):
     """An app whose screens are drawn from `known` and ask the daemon by one `link`."""
 
     known: reactive[Known] = reactive(Known(), repaint=False)
-    result_path: reactive[str] = reactive("", repaint=False, always_update=True)
-    """The calibration file that the result screen shows; empty: that of the session just captured."""
+    result_session: reactive[str] = reactive("", repaint=False, always_update=True)
+    """Session of the calibration that the result screen shows; empty: the one just captured."""
     link: DaemonLink
 
     def hear(self, status: StationStatus | None, why: str = "") -> None:
         """Take the newest status; None: there is no daemon, and `why`."""
 
-    async def show_result(self, calibration: str) -> None:
-        """Open a calibration file."""
-        self.result_path = calibration
+    async def show_result(self, session: str) -> None:
+        """Show the calibration made from a session."""
+        self.result_session = session
         await self.switch_mode("result")
 
 
@@ -149,15 +158,27 @@ class DaemonLink:
         try:
             return await work
         except (CodedError, OSError) as problem:
-            refused = isinstance(problem, RefusedError)
-            self.app.notify(
-                str(problem), severity="warning" if refused else "error", timeout=10, markup=False
-            )
+            self.tell(problem)
         return None
+
+    def tell(self, problem: Exception) -> None:
+        """Show a notice of what was refused, or failed."""
+        refused = isinstance(problem, RefusedError)
+        self.app.notify(str(problem), severity="warning" if refused else "error", timeout=10, markup=False)
 
     async def ask(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R | None:
         """Call a verb; a notice takes the place of an error."""
         return await self.attempt(self.client.call(verb, timeout_s=timeout_s))
+
+    async def result(self, session: str) -> Result | None:
+        """Ask for the calibration of a session; empty: see `GetResult`. None: there is none yet."""
+        answer = await self.client.call(verbs.GetResult(session), timeout_s=READ_S)
+        return None if answer.result is None else msgspec.convert(answer.result, Result)
+
+    async def sessions(self) -> tuple[Kept, ...]:
+        """Ask for the recorded sessions, newest first."""
+        answer = await self.client.call(verbs.GetSessions(), timeout_s=LIST_S)
+        return msgspec.convert(answer.sessions, tuple[Kept, ...])
 
     async def ask_person(self, screen: Screen[R]) -> R:
         """Ask by a window; only in a worker."""

@@ -5,21 +5,19 @@ Long work runs in a process of its own, its lines shown, and can be cancelled.
 
 from __future__ import annotations
 
-import asyncio
-from functools import partial
 from pathlib import Path
 
-from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Calibration
-from calibrate.files.install import Cell, install, rollback, withdraw
-from calibrate.files.validity import ValidityState
-from calibrate.files.versions import InstalledVersion, before_current, installed_versions, read_log
-from station.cell.session_folder import CALIBRATION_FILE, solve_arguments
+from calibrate.files.calibration import Calibration, Override
+from recordings.errors import CodedError
+from station.cell.errors import RefusedError
+from station.cell.session_folder import solve_arguments
 from station.operate.drift_check import check_arguments, recorded, start_drift_check
 from station.operate.motion import Approve
-from station.tui.daemon_link import DaemonLink
+from station.protocol.results import Installed, Result
+from station.protocol.verbs import Install, Rollback, Withdraw
+from station.tui.daemon_link import CHANGE_S, DaemonLink
 from station.tui.dialogs import Confirm, JobScreen, Reason
-from station.tui.installed import Result, local, state_root
+from station.tui.words import local
 
 OVERRIDABLE = ("gate-failed", "objection")
 """Codes of refusals that a person may override with a reason."""
@@ -32,7 +30,7 @@ async def solve_session(link: DaemonLink, recording: str, folder: str) -> None:
     what = solve_arguments(recording, folder)
     code = await link.ask_person(JobScreen(f"Solving {Path(folder).name}", "calibrate.cli", *what))
     if code in (0, 4):
-        await link.app.show_result(str(Path(folder) / CALIBRATION_FILE))
+        await link.app.show_result(Path(folder).name)
 
 
 async def recover_session(link: DaemonLink, folder: str) -> None:
@@ -61,17 +59,26 @@ async def check_drift(link: DaemonLink, approves: Approve) -> None:
 
 
 async def install_result(link: DaemonLink, result: Result, calibration: Calibration) -> None:
-    """Ask, then install. A simulated result installs on a simulated cell only."""
+    """Ask, then let the daemon install it, where that is refused with a person's reason."""
     if not await link.ask_person(install_question(result, calibration)):
         return
-    live = link.known.live
-    cell: Cell = "simulated" if live is not None and live.source == "simulated" else "real"
-    config = link.client.config
-    oldest = None if config is None else config.validity.max_age_days
-    put = partial(install, Path(result.path), state_root(result.path), cell=cell, max_age_days=oldest)
-    if await link.attempt(_installed(link, put)) is not None:
-        link.app.result_path = link.app.result_path  # the same, but its file is read again
-        link.app.notify("Installed. b undoes it.")
+    put = Install(result.session)
+    try:
+        await link.client.call(put, timeout_s=CHANGE_S)
+    except RefusedError as refusal:
+        if refusal.code not in OVERRIDABLE:
+            link.tell(refusal)
+            return
+        reason = await link.ask_person(Reason("Not installed", f"{refusal.text}\n\n{OVERRIDES}"))
+        if not reason:
+            link.app.notify("Nothing was installed.")
+            return
+        if await link.ask(Install(result.session, override=reason), timeout_s=CHANGE_S) is None:
+            return
+    except (CodedError, OSError) as problem:
+        link.tell(problem)
+        return
+    link.app.notify("Installed. b undoes it.")
 
 
 def install_question(result: Result, calibration: Calibration) -> Confirm:
@@ -91,62 +98,47 @@ def install_question(result: Result, calibration: Calibration) -> Confirm:
     return Confirm(title, "\n".join([*against, "", reads]), yes="Give a reason")
 
 
-async def _installed(link: DaemonLink, put: partial[InstalledVersion]) -> InstalledVersion | None:
-    """Install, where it is refused with a person's reason; None: none was given. Raises CalibrationError."""
-    try:
-        with link.busy("Installing …"):
-            return await asyncio.to_thread(put)
-    except CalibrationError as refusal:
-        if refusal.code not in OVERRIDABLE:
-            raise
-        asked = f"{refusal.text}\n\n{OVERRIDES}"
-    if reason := await link.ask_person(Reason("Not installed", asked)):
-        return await asyncio.to_thread(put, override=reason)
-    link.app.notify("Nothing was installed.")
-    return None
-
-
-async def undo_install(link: DaemonLink, result: Result, calibration: Calibration) -> None:
-    """Ask, then install the calibration before again; without one, take this one out of use."""
-    root, camera = state_root(result.path), calibration.camera_name
-    known = installed_versions(root, camera)
-    current = next((g for g in known if g.current), None)
-    older = before_current(known, read_log(root, camera))
-    if current is None:
+async def undo_install(link: DaemonLink, result: Result, _: Calibration) -> None:
+    """Ask, then go back to the calibration before; without one, take this one out of use."""
+    state = result.state
+    if state.version is None:
         link.app.notify("Nothing is installed.")
         return
-    if older is None:
-        await _withdraw(link, root, camera, current)
+    if state.before is None:
+        await _withdraw(link, state, state.version)
         return
-    body = f"Now: {_named(current)}\nBefore: {_named(older)}\nPrograms then read the one before."
-    if await link.ask_person(Confirm("Go back to the calibration before?", body, yes="Go back")):
-        made = await link.attempt(asyncio.to_thread(rollback, root, camera=camera))
-        if made is not None:
-            said = "The calibration before is installed again; a drift check proves it (d)."
-            link.app.notify(said)
+    before = state.before
+    named = _named(before.version, before.session, before.created, before.override)
+    body = f"Now: {_now(state, state.version)}\nBefore: {named}\nPrograms then read the one before."
+    if not await link.ask_person(Confirm("Go back to the calibration before?", body, yes="Go back")):
+        return
+    if await link.ask(Rollback(state.version), timeout_s=CHANGE_S) is not None:
+        link.app.notify("The calibration before is installed again; a drift check proves it (d).")
 
 
-async def _withdraw(link: DaemonLink, root: Path, camera: str, current: InstalledVersion) -> None:
+async def _withdraw(link: DaemonLink, state: Installed, version: int) -> None:
     """Ask why, then withdraw what is installed."""
-    if current.validity.state is ValidityState.WITHDRAWN:
+    if state.withdrawn:
         link.app.notify("It is out of use already, and there is none before it to go back to.")
         return
     body = (
-        f"{_named(current)}\nThere is none before it to go back to. Programs of this cell are refused it "
-        "from then on, until a calibration is installed.\n\nYour name and the reason are kept. "
+        f"{_now(state, version)}\nThere is none before it to go back to. Programs of this cell are refused "
+        "it from then on, until a calibration is installed.\n\nYour name and the reason are kept. "
         "Enter takes it out of use, Escape does not."
     )
     if not (reason := await link.ask_person(Reason("Take it out of use?", body))):
         return
-    if await link.attempt(asyncio.to_thread(withdraw, root, reason, camera=camera)) is not None:
+    if await link.ask(Withdraw(reason, version), timeout_s=CHANGE_S) is not None:
         link.app.notify("Out of use: programs are refused it. i installs a calibration.")
 
 
-def _named(generation: InstalledVersion) -> str:
-    calibration = generation.calibration
-    if calibration is None:
-        return f"version {generation.number}"
-    taken = calibration.override
+def _now(state: Installed, version: int) -> str:
+    """Name the installed version."""
+    if state.now is None:
+        return f"version {version}"
+    return _named(version, state.now.provenance.session, state.now.created, state.now.override)
+
+
+def _named(version: int, session: str, created: str, taken: Override | None) -> str:
     reason = "" if taken is None else f", overridden: “{taken.reason}”"
-    session = calibration.provenance.session
-    return f"version {generation.number}, session {session}, solved {local(calibration.created)}{reason}"
+    return f"version {version}, session {session}, solved {local(created)}{reason}"

@@ -31,15 +31,25 @@ from calibrate.files.validity import ValidityState, validity_text
 from calibrate.results import Gate
 from calibrate.words import Word, word_of, words_in, words_of_gates
 from recordings.cli.console import open_in_browser
-from station.cell.session_folder import REPORT_FILE
 from station.operate.next_step import StepKind, after_solve
+from station.protocol.results import Result
 from station.tui.help import Explained
-from station.tui.installed import Result, local
 from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.touch_corners import run_touch_test
-from station.tui.words import MARKS, VERDICTS, Mark, dim, limit_bar, lines, mark, sentence, shortened
+from station.tui.words import (
+    MARKS,
+    VERDICTS,
+    Mark,
+    dim,
+    limit_bar,
+    lines,
+    local,
+    mark,
+    sentence,
+    shortened,
+)
 
 NO_RESULT = "No result yet: F9 solves what was captured. On 5, Enter shows older ones."
 BAR_CELLS, NAME_CELLS = 12, 27
@@ -56,7 +66,7 @@ def verdict_lines(result: Result) -> Content:
     if calibration is None:
         return Content(result.problem or NO_RESULT)
     quality = calibration.quality
-    became = result.state.word(calibration)
+    became = result.became
     new = "ready to install" if result.verdict == "PASS" else "installs only with a reason"
     said = use_text(calibration)
     if result.verdict == "PASS WITH A REASON":
@@ -72,8 +82,7 @@ def verdict_lines(result: Result) -> Content:
         doubted = validity.state is not ValidityState.VALID
         rows.append(Content.styled(sentence(validity_text(validity)), "bold $warn" if doubted else ""))
     rows += map(Content, _to_do(result, calibration))
-    if became and not result.installed:
-        last = result.state.log[-1]
+    if became and not result.installed and (last := result.state.last) is not None:
         why = f" (“{last.reason}”)" if last.reason else ""
         rows.append(Content(f"The last change: {last.action} by {last.who}, {local(last.wall)}{why}."))
     if calibration.source != "real":
@@ -269,11 +278,10 @@ class ResultScreen(StationScreen):
 
     def action_report(self) -> None:
         result = self.known.result
-        report = Path(REPORT_FILE) if result is None else Path(result.path).with_name(REPORT_FILE)
-        if result is None or not report.is_file():
+        if result is None or not result.report:
             self.notify("There is no report of it: F9 on 5 solves again and writes one.")
-        elif not open_in_browser(report):
-            self.notify(f"No desktop was found here. The report: {report}", timeout=60, markup=False)
+        elif not open_in_browser(Path(result.report)):
+            self.notify(f"No desktop was found here. The report: {result.report}", timeout=60, markup=False)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def action_act(self, what: str) -> None:

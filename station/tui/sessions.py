@@ -10,8 +10,7 @@ from textual.binding import Binding, BindingType
 from textual.content import Content
 from textual.widgets import Static
 
-from calibrate.files.formatting import figures
-from station.tui.installed import Kept
+from station.protocol.results import Kept
 from station.tui.jobs import check_session, recover_session, solve_session
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
@@ -74,7 +73,7 @@ class SessionsScreen(StationScreen):
             case "show" if not session.calibration:
                 self.notify("Not solved yet: F9 solves it.")
             case "show":
-                await link.app.show_result(session.calibration)
+                await link.app.show_result(session.name)
             case "check":
                 await check_session(link, session.recording, session.folder)
             case "recover":
@@ -86,12 +85,12 @@ class SessionsScreen(StationScreen):
 
 
 def _row(kept: Kept) -> tuple[Content, ...]:
-    session, found, check = kept.session, kept.calibration, kept.check
+    session = kept.session
+    check = kept.check
     error = Content()
     became, verdict = kept.word, mark("todo", "not solved")
-    if found is not None:
-        figure = figures(found)["error"]
-        error = facts(("", figure.value, figure.about))
+    if kept.verdict is not None:
+        error = facts(("", *kept.error))
         verdict = mark(VERDICTS[kept.verdict], kept.verdict)
         became = became or "solved, not installed"
     elif check is not None:

@@ -19,9 +19,9 @@ from station.cell.status import (
 )
 from station.operate.goal import above_goal
 from station.operate.next_step import StepKind, after_solve
+from station.protocol.results import Kept, Result
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
-from station.tui.installed import Kept, Result
 from station.tui.words import UNKNOWN, Mark, duration, many, sentence
 
 STEPS = ("connect", "plan", "capture", "result")

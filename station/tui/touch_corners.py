@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-from pathlib import Path
 from typing import ClassVar
 
 from rich.text import Text
@@ -17,9 +15,9 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch, touch_text
 from recordings.errors import CodedError
 from station.operate.tip_offsets import SeenBoard, note_touches, read_touch, see_board
+from station.protocol.results import Result
 from station.tui.daemon_link import DaemonLink
 from station.tui.frame import Question
-from station.tui.installed import Result, state_root
 
 ABOUT = (
     "Bring the tip of the tool or pointer onto a corner of the board, with freedrive or the pendant, hold it "
@@ -69,13 +67,12 @@ class TouchCorners(Question[list[Touch]]):
         self.dismiss(list(self._found.values()))
 
 
-async def run_touch_test(link: DaemonLink, result: Result, _: Calibration) -> None:
-    """Read corners until the person ends it, then write what was found into the file."""
-    path = Path(result.path)
-    board = await link.attempt(see_board(link.client, link.known.shown, path))
+async def run_touch_test(link: DaemonLink, result: Result, calibration: Calibration) -> None:
+    """Read corners until the person ends it, then let the daemon write what was found."""
+    board = await link.attempt(see_board(link.client, link.known.shown, calibration))
     if board is None or not (touches := await link.ask_person(TouchCorners(board))):
         return
-    words = await link.attempt(asyncio.to_thread(note_touches, state_root(path), path, touches))
+    words = await link.attempt(note_touches(link.client, result.session, touches))
     if words:
         link.app.notify(words, markup=False)
-        await link.app.show_result(link.app.result_path)
+        await link.app.show_result(link.app.result_session)

@@ -11,6 +11,7 @@ from textual.content import Content
 
 from calibrate.files.calibration import Verdict
 from calibrate.files.formatting import predicted_error
+from calibrate.files.validity import parse_time
 from station.cell.status import StationState, StationStatus
 
 STATE_WORDS = {state: state.value.upper() for state in StationState} | {
@@ -133,6 +134,12 @@ def state_of(status: StationStatus) -> tuple[str, str]:
 
 def duration(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+def local(iso: str) -> str:
+    """Convert a file's UTC time to local time; what is no time stays as it is."""
+    when = parse_time(iso)
+    return iso if when is None else when.astimezone().strftime("%Y-%m-%d %H:%M")
 
 
 def many(count: int, what: str) -> str:

@@ -288,7 +288,7 @@ class Rig:
         mover = None if by_hand else robot
         cell = Cell(memory_config(), robot, self.camera, source, mover, attachments={"truth.json": b"{}"})
         self.session = Session(cell, root)
-        self.session.context.workers = self.worker
+        self.session.context.workers = self.session.results.reader = self.worker
         if not guides:
             self.session.freedrive.run = asyncio.Event().wait
         self.states: list[StationState] = []

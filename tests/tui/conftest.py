@@ -18,6 +18,7 @@ from textual.app import App
 from textual.pilot import Pilot
 from textual.widgets import Static
 
+from recordings.errors import CodedError
 from recordings.schema.messages import CameraIdentity, CameraModel, RobotIdentity
 from station.cell.config import (
     PAPER_BOARD,
@@ -27,6 +28,7 @@ from station.cell.config import (
     RobotConfig,
     StationConfig,
 )
+from station.cell.errors import RefusedError
 from station.cell.status import (
     ArmCondition,
     CameraStatus,
@@ -39,11 +41,29 @@ from station.cell.status import (
     StationStatus,
 )
 from station.protocol.client import Client
-from station.protocol.verbs import VERBS, Doctor, Done, Preview, PreviewImage, Verb, Watch
+from station.protocol.verbs import (
+    VERBS,
+    Doctor,
+    Done,
+    GetInstalled,
+    GetResult,
+    GetSessions,
+    Install,
+    NoteTouches,
+    Preview,
+    PreviewImage,
+    Rollback,
+    Verb,
+    Watch,
+    Withdraw,
+)
+from station.session.context import StatusStore
+from station.session.results import Results
 from station.simulation.cells import TABLE
 from station.tui.app import StationApp
 from tests.patience import PATIENCE_S
 from tests.recordings.small_recording import make_state
+from tests.station.session_rig import WorkerInThisProcess
 
 SUMMARY = MotionPreview(
     token="t-1",
@@ -81,6 +101,11 @@ async def until(pilot: Pilot[None], condition: Callable[[], object]) -> None:
         await pilot.pause(0.02)
 
 
+LOOKS = (Preview, Watch, Doctor, GetResult, GetSessions, GetInstalled)
+"""Verbs by which a screen only looks."""
+ON_RESULTS = (GetResult, GetSessions, GetInstalled, Install, Rollback, Withdraw, NoteTouches)
+
+
 class FakeLink(Client):
     """Answers like a daemon in a good mood; `refuse` maps verbs to errors."""
 
@@ -96,13 +121,62 @@ class FakeLink(Client):
         """By the name of a verb: what its answer waits for."""
         self.same_image, self._images = False, 0
         self._serves = False
-        self.show(idle())
+        self._results: Results | None = None
+        self._looking: asyncio.Task[None] | None = None
+        self._root: Path | None = None
+        """The one below which `_results` are."""
+        self._store = StatusStore(idle())
+        self._store.watch(self._told)
+        self._told()
 
     def show(self, status: StationStatus | None) -> None:
-        """The next status; None = the daemon dies."""
-        self._plain_status = None if status is None else msgspec.to_builtins(status)
-        self._serves = self._serves and status is not None
+        """The next status, but for what is installed; None = the daemon dies."""
+        if status is not None:
+            fields = msgspec.structs.asdict(status)
+            self._store.update(**fields | {"results": self._store.status.results})
+            self._told()
+            return
+        self._plain_status = None
+        self._serves = False
         self._tell()
+
+    def _told(self) -> None:
+        self._plain_status = msgspec.to_builtins(self._store.status)
+        self._tell()
+
+    def _below_root(self) -> Results:
+        """The daemon's own door to the results below `root`, which looks twenty times a second."""
+        if self._results is None or self._root is not self.root:
+            self._root = self.root
+            config = self.config or CELL
+            self._results = Results(config, "simulated", self.root, self._store, WorkerInThisProcess())
+            self._looking = asyncio.create_task(self._look(self._results))
+        return self._results
+
+    async def _look(self, results: Results) -> None:
+        while self._serves and results is self._results:
+            await results.look()
+            await asyncio.sleep(0.05)
+
+    async def _result(self, verb: Verb[Any]) -> object:
+        """Answer a verb on results as the daemon does; None: it is another verb."""
+        results = self._below_root()
+        match verb:
+            case GetResult():
+                return await results.result(verb.session)
+            case GetSessions():
+                return await results.sessions()
+            case GetInstalled():
+                return await results.installed()
+            case Install():
+                return await results.install(verb, "anna")
+            case Rollback():
+                return await results.rollback(verb, "anna")
+            case Withdraw():
+                return await results.withdraw(verb, "anna")
+            case NoteTouches():
+                return await results.note_touches(verb, "anna")
+        return None
 
     async def open(self) -> Client:
         if self._plain_status is None:
@@ -116,10 +190,11 @@ class FakeLink(Client):
 
     @property
     def verbs(self) -> list[str]:
-        return [verb.verb() for verb in self.asked if not isinstance(verb, (Preview, Watch, Doctor))]
+        return [verb.verb() for verb in self.asked if not isinstance(verb, LOOKS)]
 
     async def request(self, verb: str, *, timeout_s: float = 0.0, **args: object) -> object:
-        self.asked.append(msgspec.convert(args, VERBS[verb]))
+        asked = msgspec.convert(args, VERBS[verb])
+        self.asked.append(asked)
         while self.silent.is_set():
             await asyncio.sleep(0.01)
         if verb in self.slow:
@@ -127,6 +202,11 @@ class FakeLink(Client):
         if verb in self.refuse:
             raise self.refuse[verb]
         answer = self.answers.get(verb, Done())
+        if isinstance(asked, ON_RESULTS) and verb not in self.answers:
+            try:
+                answer = await self._result(asked)
+            except CodedError as error:
+                raise RefusedError.from_data(error.data) from None
         if verb == "preview":
             self._images += not self.same_image
             answer = msgspec.structs.replace(answer, sequence=self._images)

@@ -11,11 +11,12 @@ import pytest
 from calibrate.check.history import CheckEntry, Trend, append_check
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
+from station.analysis.result_files import read_history
 from station.cell.status import StationState, StationStatus
 from station.protocol import verbs
+from station.protocol.results import Installed, Result
 from station.tui import jobs
 from station.tui.dialogs import ConfirmMotion, JobScreen
-from station.tui.installed import Installed, Result, read_installed
 from station.tui.result import check_rows
 from tests.tui.conftest import FakeLink, after_check, idle, in_session, opened, said, text_of, until
 from tests.tui.test_install import GOOD
@@ -98,8 +99,8 @@ def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) 
         number = install(path, root, cell="simulated", camera=camera).number
         entry = CheckEntry(0.0, number, camera, True, (0.0,) * 6, 1.0, 12.6)
         append_check(entry, root, camera)
-    assert [check.recording for check in read_installed(root, "right").drift] == ["right"]
-    assert not read_installed(root).drift
+    assert [check.recording for check in read_history(root, "right").installed.drift] == ["right"]
+    assert not read_history(root, "main").installed.drift
     write_calibration(msgspec.structs.replace(GOOD, created="2026-02-01T00:00:00+00:00"), path)
     install(path, root, cell="simulated", camera="right")
-    assert not read_installed(root, "right").drift and read_installed(root, "left").drift
+    assert not read_history(root, "right").installed.drift and read_history(root, "left").installed.drift

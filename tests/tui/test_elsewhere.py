@@ -13,10 +13,9 @@ from calibrate.files.calibration import Calibration, read_calibration, write_cal
 from calibrate.files.folders import calibrations_folder
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
+from station.analysis.result_files import read_history, read_result, read_sessions
 from station.cell.pose_plan import Plan
 from station.cell.session_folder import SessionState, write_state
-from station.tui import app as app_module
-from station.tui.installed import read_installed, read_result, read_sessions
 from station.tui.sessions import _row
 from station.tui.task import next_action
 from tests.tui.conftest import FakeLink, after_check, app_on, idle, in_session, opened, text_of, until
@@ -24,8 +23,8 @@ from tests.tui.test_install import GOOD, OFF
 
 
 @pytest.fixture
-def root(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Two solved sessions; the screens look twenty times a second."""
+def root(link: FakeLink, tmp_path: Path) -> Path:
+    """Two solved sessions below the root of the daemon."""
     for name, created in (("s-1", "2026-01-01"), ("s-2", "2026-01-02")):
         folder = tmp_path / "sessions" / name
         folder.mkdir(parents=True)
@@ -34,7 +33,6 @@ def root(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
         write_calibration(
             msgspec.structs.replace(GOOD, created=created, provenance=provenance), folder / "calibration.yaml"
         )
-    monkeypatch.setattr(app_module, "LOOK_S", 0.05)
     link.root = tmp_path
     return tmp_path
 
@@ -76,7 +74,7 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
 async def test_the_result_says_what_is_installed_and_who_took_it_back(link: FakeLink, root: Path) -> None:
     async with opened(link) as pilot:
         app = pilot.app
-        await app.show_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
+        await app.show_result("s-1")
         await until(pilot, lambda: "ready to install" in text_of(app, "#verdict"))
         assert "Nothing is installed" in text_of(app, "#evidence")
         put(root, "s-1")
@@ -86,7 +84,7 @@ async def test_the_result_says_what_is_installed_and_who_took_it_back(link: Fake
         await until(pilot, lambda: "from the one before" in text_of(app, "#evidence"))
         assert "installed before" in text_of(app, "#verdict")
         rollback(root, reason="the camera had slipped")
-        await app.show_result(str(root / "sessions" / "s-2" / "calibration.yaml"))
+        await app.show_result("s-2")
         await until(pilot, lambda: "had slipped" in text_of(app, "#verdict"))
         said = text_of(app, "#verdict")
         assert "installed before" in said
@@ -99,10 +97,10 @@ async def test_the_result_says_what_is_installed_and_who_took_it_back(link: Fake
 
 def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
     put(root, "s-1")
-    note_installed(root, read_installed(root).now, [OFF])
-    assert read_installed(root).word(solve_of(root, "s-1")) == "INSTALLED, in doubt"
+    note_installed(root, read_history(root, "main").installed.now, [OFF])
+    assert read_result(root / "sessions" / "s-1" / "calibration.yaml", root).became == "INSTALLED, in doubt"
     put(root, "s-2")
-    assert {c.provenance.session for c in read_installed(root).earlier} == {"s-1"}
+    assert {c.provenance.session for c in read_history(root, "main").earlier} == {"s-1"}
 
 
 async def test_a_session_that_was_solved_again_is_not_what_is_installed(link: FakeLink, root: Path) -> None:
@@ -116,7 +114,7 @@ async def test_a_session_that_was_solved_again_is_not_what_is_installed(link: Fa
         await until(pilot, lambda: app.known.result and app.known.sessions)
         assert app.known.result.installed
         assert [kept.word for kept in app.known.sessions] == ["", ""]
-        await app.show_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
+        await app.show_result("s-1")
         await until(pilot, lambda: "ready to install" in text_of(app, "#verdict"))
 
 
@@ -147,7 +145,7 @@ async def test_before_a_session_the_result_is_what_is_installed(
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.known.result and app.known.sessions)
-        assert app.known.result is not None and app.known.result.state.log and app.known.result.installed
+        assert app.known.result is not None and app.known.result.state.last and app.known.result.installed
         assert next_action(app.known).key == "d"
         await pilot.press("4")
         await until(
@@ -177,7 +175,7 @@ async def test_a_session_has_the_verdict_that_result_shows(link: FakeLink, root:
     if instead:
         install(path, root, cell="simulated", override="measured with the tape")
     found = {kept.session.name: kept for kept in read_sessions(root, "main")}
-    assert found["s-2"].verdict == read_result(str(path)).verdict == "PASS WITH A REASON"
+    assert found["s-2"].verdict == read_result(path, root).verdict == "PASS WITH A REASON"
     assert "PASS WITH A REASON" in _row(found["s-2"])[2].plain
-    other = read_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
+    other = read_result(root / "sessions" / "s-1" / "calibration.yaml", root)
     assert found["s-1"].verdict == other.verdict

@@ -14,8 +14,8 @@ from calibrate.files.calibration import Calibration, write_calibration
 from calibrate.pipeline.gates import ADVICE, GateLimits
 from calibrate.results import Gate
 from calibrate.words import words_in, words_of_gates
+from station.protocol.results import Installed, Result
 from station.tui.help import Explained
-from station.tui.installed import Installed, Result
 from station.tui.result import check_rows, evidence_sections
 from tests.tui.conftest import FakeLink, opened, text_of, until
 from tests.tui.test_install import GOOD, OFF
@@ -48,7 +48,8 @@ async def on_result(pilot: Pilot[None], folder: Path, calibration: Calibration) 
     path = folder / "sessions" / "s-1" / "calibration.yaml"
     path.parent.mkdir(parents=True)
     write_calibration(calibration, path)
-    pilot.app.result_path = str(path)
+    pilot.app.link.client.root = folder
+    pilot.app.result_session = "s-1"
     await pilot.press("4")
     await until(pilot, lambda: "PASS" in text_of(pilot.app, "#verdict"))
 

@@ -21,12 +21,15 @@ from calibrate.files.validity import Validity, ValidityReason, ValidityState
 from calibrate.files.versions import installed_versions, note_installed
 from calibrate.results import Gate
 from recordings.schema.messages import CameraIdentity, RobotIdentity
+from station.analysis import result_files
+from station.analysis.result_files import read_history
 from station.cell.status import StationState
+from station.protocol.results import Installed, Result
 from station.tui.dialogs import Confirm, Reason
-from station.tui.installed import Installed, Result, local, read_installed
 from station.tui.jobs import install_question
 from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
+from station.tui.words import local
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
@@ -40,7 +43,9 @@ DOUBTED = msgspec.structs.replace(GOOD, verification=[OFF])
 
 
 @pytest.fixture
-def calibration(tmp_path: Path) -> Path:
+def calibration(link: FakeLink, tmp_path: Path) -> Path:
+    """Of session s-1, below the root of the daemon."""
+    link.root = tmp_path
     path = tmp_path / "sessions" / "s-1" / "calibration.yaml"
     path.parent.mkdir(parents=True)
     write_calibration(DOUBTED, path)
@@ -80,7 +85,7 @@ def test_terminal_and_screen_say_the_same_verdict_and_figures() -> None:
 
 async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> None:
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-    pilot.app.result_path = str(calibration)
+    pilot.app.result_session = calibration.parent.name
     await pilot.press("4")
     await until(pilot, lambda: "PASS WITH A REASON" in text_of(pilot.app, "#verdict"))
     await pilot.press(*keys)
@@ -125,6 +130,7 @@ async def test_going_back_names_both_and_asks(link: FakeLink, calibration: Path)
             write_calibration(made, path)
             install(path, calibration.parents[2], cell="simulated")
         note_installed(calibration.parents[2], LATER, [OFF])  # a generation more, of the same solve
+        await until(pilot, lambda: pilot.app.known.result.state.version == 3)
         await pilot.press("b")
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         body = str(pilot.app.screen.query_one("#confirm-body", Static).render())
@@ -142,7 +148,7 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
     write_calibration(GOOD, calibration)
     install(calibration, root, cell="simulated")
     async with opened(link, notifications=True) as pilot:
-        pilot.app.result_path = str(calibration)
+        pilot.app.result_session = calibration.parent.name
         await pilot.press("4")
         for answer in ("escape", "enter"):
             await until(pilot, lambda: "INSTALLED" in text_of(pilot.app, "#verdict"))
@@ -169,7 +175,7 @@ async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready
     vague = tuple(tuple(81 * value for value in row) for row in GOOD.covariance)
     write_calibration(msgspec.structs.replace(LATER, covariance=vague), calibration)
     async with opened(link) as pilot:
-        pilot.app.result_path = str(calibration)
+        pilot.app.result_session = calibration.parent.name
         await pilot.press("4")
         await until(pilot, lambda: "INSTALL" in text_of(pilot.app, "#verdict").upper())
         told = text_of(pilot.app, "#verdict")
@@ -203,13 +209,13 @@ def test_what_is_installed_and_its_validity_are_of_one_version(
     install(calibration, root, cell="simulated")
 
     def meanwhile(path: Path) -> Calibration:
-        monkeypatch.setattr("station.tui.installed.read_calibration", read)
+        monkeypatch.setattr(result_files, "read_calibration", read)
         write_calibration(LATER, calibration)
         install(calibration, root, cell="simulated")
         return read(path)
 
-    monkeypatch.setattr("station.tui.installed.read_calibration", meanwhile)
-    found = read_installed(root)
+    monkeypatch.setattr(result_files, "read_calibration", meanwhile)
+    found = read_history(root, "main").installed
     assert found.now == GOOD and found.validity is not None and found.validity.version == 1
 
 
@@ -223,7 +229,7 @@ def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() ->
     doubt = Validity(1, ValidityState.IN_DOUBT, "2026-11-22T04:50:00+00:00", reason)
     state = Installed(GOOD, validity=doubt)
     told = verdict_lines(Result("", GOOD, state)).plain
-    assert state.word(GOOD) == "INSTALLED, in doubt"
+    assert Result("", GOOD, state).became == "INSTALLED, in doubt"
     assert "PASS, INSTALLED, in doubt" in told and reason.text in told
 
 
@@ -234,7 +240,7 @@ def test_a_withdrawn_calibration_never_reads_as_one_that_is_installed() -> None:
     told = verdict_lines(Result("", GOOD, state)).plain
     assert told.splitlines()[0].startswith("✗ WITHDRAWN") and "INSTALLED" not in told
     assert reason.text in told
-    assert "INSTALLED" not in state.word(GOOD) and "INSTALLED" not in state.held
+    assert "INSTALLED" not in Result("", GOOD, state).became and "INSTALLED" not in state.held
     compared = evidence(Result("", LATER, state), LATER).plain
     assert "from the one before" not in compared and "withdrawn" in compared
     assert "from the one before" in evidence(Result("", LATER, Installed(GOOD)), LATER).plain

@@ -24,7 +24,8 @@ def daemon() -> Daemon:
 
 
 @pytest.fixture
-def calibration(tmp_path: Path, daemon: Daemon) -> Path:
+def calibration(link: FakeLink, tmp_path: Path, daemon: Daemon) -> Path:
+    link.root = tmp_path
     path = tmp_path / "sessions" / "s-1" / "calibration.yaml"
     path.parent.mkdir(parents=True)
     write_calibration(daemon.calibration, path)
@@ -35,7 +36,7 @@ async def begin(pilot: Pilot[None], link: FakeLink, calibration: Path, daemon: D
     """On the result screen, `h`."""
     link.answers["observe"], link.config = daemon.observation, daemon.config
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-    pilot.app.result_path = str(calibration)
+    pilot.app.result_session = calibration.parent.name
     await pilot.press("4")
     await until(pilot, lambda: "install" in text_of(pilot.app, "#verdict").lower())
     await pilot.press("h")
@@ -47,7 +48,7 @@ async def touch(pilot: Pilot[None], link: FakeLink, daemon: Daemon, beside_mm: t
     place = board_points(daemon.truth.board)[corner] + np.array(beside_mm) / 1000
     status = msgspec.structs.replace(idle(), robot=daemon.touching(place).robot)
     link.show(status)
-    await until(pilot, lambda: pilot.app.known.status == status)
+    await until(pilot, lambda: pilot.app.known.shown.robot == status.robot)
     await pilot.press("enter")
 
 

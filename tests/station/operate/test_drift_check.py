@@ -10,7 +10,6 @@ import pytest
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import MotionPreview, PoseStatus, SessionStatus, StationState, StationStatus
-from station.operate import drift_check
 from station.operate.drift_check import recorded, start_drift_check
 from station.protocol import verbs
 from tests.station.operate.test_motion import Telling
@@ -25,10 +24,10 @@ def loaded(*attempts: int) -> StationStatus:
 
 
 @pytest.fixture
-def link(monkeypatch: pytest.MonkeyPatch) -> FakeLink:
+def link() -> FakeLink:
     """Of a cell with something installed."""
-    monkeypatch.setattr(drift_check, "installed_calibration", lambda root, camera: None)
     link = FakeLink()
+    link.answers["installed"] = verbs.InstalledVersion(1, "valid")
     link.answers["prepare"] = PREVIEW
     return link
 
@@ -90,4 +89,4 @@ async def test_an_arm_that_a_person_moves_is_guided(link: FakeLink) -> None:
     status = loaded()
     by_hand = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, by_hand=True))
     assert await start_drift_check(link, by_hand, AsyncMock())
-    assert link.asked == [verbs.Freedrive(True, check=True)]
+    assert link.asked == [verbs.GetInstalled(), verbs.Freedrive(True, check=True)]

@@ -60,11 +60,10 @@ class Daemon:
         assert isinstance(verb, Observe)
         return self.observation
 
-    async def seen(self, folder: Path) -> SeenBoard:
-        write_calibration(self.calibration, folder / "c.yaml")
+    async def seen(self) -> SeenBoard:
         robot, camera = RobotStatus(self.robot), CameraStatus(self.photographer)
         status = StationStatus(source="simulated", mount=self.truth.mount, robot=robot, camera=camera)
-        return await see_board(self, status, folder / "c.yaml")
+        return await see_board(self, status, self.calibration)
 
     def touching(self, place_m: Array, tip_m: tuple[float, ...] = TIP, still: bool = True) -> StationStatus:
         """The arm with the tip there in `board`, however the flange is turned."""
@@ -82,24 +81,25 @@ async def test_the_tip_on_the_true_corner_tells_the_offset_the_other_way_round(
     """And whoever holds it: a name that is no UTF-8 goes into the file, too."""
     monkeypatch.setenv("LOGNAME", os.fsdecode(b"anna\xff"))
     daemon = Daemon(mount)
-    board = await daemon.seen(tmp_path)
+    board = await daemon.seen()
     corner = board_points(daemon.truth.board)[CORNER]
     touch = read_touch(board, CORNER, daemon.touching(corner + np.array([2e-4, -1e-4, 1e-3])))
     assert touch.offset_mm == pytest.approx((-0.2, 0.1), abs=0.02)
     assert touch.corner_mm == pytest.approx(1000 * corner[:2])
     assert (touch.corner, touch.found) == (CORNER, "read from the arm")
     assert 0.01 < min(touch.sigma_mm) <= max(touch.sigma_mm) < 1
+    write_calibration(daemon.calibration, tmp_path / "c.yaml")
     assert note_in_file(tmp_path / "c.yaml", [touch]).verification == [touch]
 
 
 @pytest.mark.parametrize(("configured", "tip"), [(True, TIP), (False, PENDANT[:3])])
 async def test_the_pointer_is_the_configured_one_else_the_pendants(
-    configured: bool, tip: tuple[float, ...], tmp_path: Path
+    configured: bool, tip: tuple[float, ...]
 ) -> None:
     daemon = Daemon()
     if not configured:
         daemon.config = msgspec.structs.replace(daemon.config, pointer=None)
-    board = await daemon.seen(tmp_path)
+    board = await daemon.seen()
     corner = board_points(daemon.truth.board)[CORNER]
     touch = read_touch(board, CORNER, daemon.touching(corner, tip))
     assert touch.offset_mm == pytest.approx((0.0, 0.0), abs=0.02)
@@ -114,19 +114,19 @@ async def test_the_pointer_is_the_configured_one_else_the_pendants(
     ],
 )
 async def test_a_tip_off_the_board_or_at_another_corner_is_no_touch(
-    beside: tuple[float, ...], code: str, tmp_path: Path
+    beside: tuple[float, ...], code: str
 ) -> None:
     daemon = Daemon()
-    board = await daemon.seen(tmp_path)
+    board = await daemon.seen()
     there = daemon.touching(board_points(daemon.truth.board)[CORNER] + beside)
     with raises(code) as refused:
         read_touch(board, CORNER, there)
     assert refused.value.values["distance_m"] == pytest.approx(max(map(abs, beside)), abs=1e-4)
 
 
-async def test_what_is_not_known_and_another_cell_are_refused(tmp_path: Path) -> None:
+async def test_what_is_not_known_and_another_cell_are_refused() -> None:
     daemon = Daemon()
-    board = await daemon.seen(tmp_path)
+    board = await daemon.seen()
     for status in (None, StationStatus()):
         with raises("no-robot-state"):
             read_touch(board, CORNER, status)
@@ -144,7 +144,7 @@ async def test_what_is_not_known_and_another_cell_are_refused(tmp_path: Path) ->
         (unknown, "no-robot-state"),
     ):
         with raises(code):
-            await other.seen(tmp_path)
+            await other.seen()
 
 
 def test_the_predicted_offset_is_what_repetitions_show() -> None:

@@ -67,6 +67,7 @@ PLANTS = [
     ("station/simulation", "station.session"),
     ("station/simulation/controller", "station.devices.ur"),
     ("station/tui", "station.devices"),
+    ("station/tui", "calibrate.files.versions"),
     ("station/cli", "gi"),
 ]
 """A room, and an import that is forbidden in it."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from recordings.errors import CodedError
 from station.cell.config import ApprovalConfig
 from station.cell.errors import RefusedError
 from station.cell.layout import approval_sha256
@@ -74,7 +75,7 @@ async def test_a_program_may_ask_what_the_table_says_and_nothing_else(
     if needs is Needs.NOBODY:
         try:
             await client.ask(verb, **arguments)
-        except RefusedError as refusal:
+        except CodedError as refusal:
             assert refusal.code not in ("no-terminal", "no-service")
     else:
         with pytest.raises(RefusedError) as refused:

@@ -88,8 +88,8 @@ def test_what_each_check_found_is_a_row_that_tells_what_to_do() -> None:
     creeping = msgspec.structs.replace(held, trend=Trend(0.4, 0.0, 40.0, 8))
     drift = (sure, weak, creeping, held)
     newest_first = check_rows(Result("", GOOD, Installed(GOOD, drift=drift)), GOOD)[-4:]
-    assert [cells[0].plain[0] for cells, _ in newest_first] == ["✓", "▲", "✗", "✗"]
-    assert len({advice for _, advice in newest_first}) == 4
+    assert [cells[0].plain[0] for cells, _, _ in newest_first] == ["✓", "▲", "✗", "✗"]
+    assert len({advice for _, advice, _ in newest_first}) == 4
 
 
 def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.solution import UncorrectedArm, camera_frames
 from calibrate.handeye.stated_point import corrected_error_mm, uncorrected_error_mm
-from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
-from recordings.geometry import Array, Transform, difference, perturb
+from calibrate.handeye.uncorrected_arm import uncorrected_arm
+from recordings.geometry import Array, Transform, difference
 
 _NOMINAL_M = 1e-4
 """Above this rms distance (m) the recorded flanges were not computed with the nominal arm."""
@@ -31,21 +31,7 @@ def arm_results(
     errors = state.arm_errors[:count]
     places = np.append(np.arange(6), Layout.of(state).arm_errors.start + np.arange(count))
     covariance = found.covariance[np.ix_(places, places)]
-    joints = sample_range(arm.joints_rad) if table is None else sample_workspace(table, arm.joints_rad)
-
-    def over(q: Array, spread: Array) -> Workspace:
-        return Workspace.of(
-            fit.views.mount, chain.forward(q), chain.by_links(q), state.X, state.Y, distance_m, spread
-        )
-
-    room = over(joints, SPREAD[:1])
-    by_errors = (over(joints, SPREAD) + over(arm.joints_rad, SPREAD)).for_uncorrected()
-    both = np.concatenate([np.eye(6), by_errors], axis=1)
-    corrected_m = room.rms_m(covariance)
-    left_m = room.error_m(by_errors @ errors, errors)
-    uncorrected = UncorrectedArm(
-        perturb(state.X, by_errors @ errors), both @ covariance @ both.T, float(np.hypot(corrected_m, left_m))
-    )
+    uncorrected = uncorrected_arm(fit, arm, distance_m)
     refused, corrected = _refusal(fit, arm, detected, missed), chain.with_errors(errors)
     offered = not refused
     true = None

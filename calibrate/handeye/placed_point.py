@@ -77,18 +77,18 @@ class PlacedPoint:
         mount: Mount,
         known: KnownErrors,
         installed: Array,
-        distance_m: float,
+        point: Array,
         postures: Postures,
         tool_m: float | None = None,
     ) -> PlacedPoint:
         """Linearise for pairs of `postures` and X̂ = `installed` (4, 4).
 
+        point: (3,) p in the camera, as `on_axis` gives it.
         tool_m: how far from the flange the tool ends. A point is placed from those postures whose flange is
         no farther than that from it, and where there is none, from the nearest. None: recorded postures, of
         which each pair counts but one with itself.
         """
-        p = np.array([0.0, 0.0, distance_m])
-        seen = points_seen(mount, installed, distance_m, postures.flange)
+        seen = points_seen(mount, installed, point, postures.flange)
         in_hand = mount == "eye-in-hand"
         if in_hand and tool_m is None:
             pairs = _Pairs.of_recorded(len(seen))
@@ -96,7 +96,7 @@ class PlacedPoint:
             farthest_m = np.inf if tool_m is None else tool_m
             pairs = _Pairs.within(farthest_m, seen, postures.flange[:, :3, 3])
         make = _in_hand if in_hand else _fixed
-        return make(postures, pairs, seen, known, installed, p)
+        return make(postures, pairs, seen, known, installed, point)
 
     def mean_square(self, covariance: Array, noise: Array) -> float:
         """Average |e|², m²; `covariance` and `noise` as in `KnownErrors`."""
@@ -104,8 +104,12 @@ class PlacedPoint:
 
     def by_uncertainty(self, covariance: Array) -> float:
         """Average |e|², m², by what is uncertain of [X, errors] alone."""
-        K = np.einsum("mik,mil->kl", self.by_unknown, self.by_unknown) / len(self.mean)
-        return float(np.sum(K * covariance))
+        return float(np.sum(self.quadratic() * covariance))
+
+    def quadratic(self) -> Array:
+        """Make the matrix K (6 + q + b, 6 + q + b), m² and so on: trace(K C) is what C adds to |e|²."""
+        J = self.by_unknown.reshape(-1, self.by_unknown.shape[2])
+        return np.asarray(J.T @ J / len(self.mean))
 
     def systematic(self) -> float:
         """Average |e|², m², by the means alone: known, and yet in every point."""
@@ -168,7 +172,7 @@ class PointPrediction:
         count = postures.by_arm.shape[2]
         robot = np.array([noise.robot_m, noise.robot_rad])
         exact = KnownErrors(X, np.zeros(count), np.zeros((6 + count, 6 + count)), robot, 1.0)
-        return cls(PlacedPoint.of(mount, exact, X, distance_m, postures), robot)
+        return cls(PlacedPoint.of(mount, exact, X, on_axis(distance_m), postures), robot)
 
     def error_m(self, covariance: Array) -> float:
         """Compute the rms of |e|, metres. covariance: (6 + q, 6 + q) of [X, errors of the arm]."""
@@ -180,17 +184,30 @@ class PointPrediction:
         return float(np.sqrt(self.point.by_chance(self.noise)))
 
 
-def points_seen(mount: Mount, X: Array, distance_m: float, flange: Array) -> Array:
-    """Compute where, in base, the points are that the camera sees on its axis, metres.
+def on_axis(distance_m: float) -> Array:
+    """Return the point (3,) on the camera's axis, in the camera."""
+    return np.array([0.0, 0.0, distance_m])
+
+
+def points_seen(mount: Mount, X: Array, point: Array, flange: Array) -> Array:
+    """Compute where, in base, the points are that the camera sees at `point` (3,), metres.
 
     X: (4, 4); flange: (n, 4, 4) base_from_flange. Returns (n, 3), one for each flange that carries the
     camera, and (1, 3) for a fixed camera.
     """
-    p = np.array([0.0, 0.0, distance_m])
-    in_parent = X[:3, :3] @ p + X[:3, 3]
+    in_parent = X[:3, :3] @ point + X[:3, 3]
     if mount == "eye-in-hand":
         return np.asarray(flange[:, :3, :3] @ in_parent + flange[:, :3, 3])
     return np.asarray(in_parent[None])
+
+
+def farthest_tool_m(mount: Mount, X: Array, point: Array, flange: Array) -> float:
+    """Compute how far the tool ends from the flange, metres, if it reaches what each flange (n, 4, 4) sees.
+
+    As `PlacedPoint.of` takes it for postures elsewhere in the workspace.
+    """
+    seen = points_seen(mount, X, point, flange)
+    return float(np.linalg.norm(seen - flange[:, :3, 3], axis=1).max())
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,11 +109,9 @@ class UncorrectedArm:
     """The X for an arm that stays as it is, with its errors: what its controller's flanges need."""
 
     X: Array
-    """(4, 4) the best over the workspace and where the views are."""
+    """(4, 4) by which points are placed best, where the views are and elsewhere in the workspace."""
     covariance: Array
     """(6, 6)"""
-    error_m: float
-    """1σ of a point over the workspace, the arm's own errors included."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,13 @@ from calibrate.handeye.cell_fit import CellFit
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.estimate import Estimate
 from calibrate.handeye.information import MORE_VIEWS
-from calibrate.handeye.placed_point import KnownErrors, PlacedPoint, Postures, points_seen
+from calibrate.handeye.placed_point import (
+    KnownErrors,
+    PlacedPoint,
+    Postures,
+    farthest_tool_m,
+    on_axis,
+)
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.handeye.workspace import sample_around
 from calibrate.results import PointError
@@ -46,22 +52,22 @@ def state_point(
     """
     basis = _basis(fit)
     found = basis.estimate
-    recorded = _postures(basis.flange, basis.by_arm_errors)
-    known = _known(found, found.covariance)
+    recorded = recorded_postures(basis.flange, basis.by_arm_errors)
+    point = on_axis(distance_m)
+    known = known_errors(found, found.covariance)
     told = np.zeros_like(known.covariance)
     told[:6, :6] = stated
     known = replace(known, covariance=known.covariance + told)
-    at_recorded = PlacedPoint.of(fit.views.mount, known, installed, distance_m, recorded)
+    at_recorded = PlacedPoint.of(fit.views.mount, known, installed, point, recorded)
     square = at_recorded.mean_square(known.covariance, known.noise)
     workspace = square
     if basis.workspace is not None:
-        seen = points_seen(fit.views.mount, installed, distance_m, basis.flange)
-        tool_m = float(np.linalg.norm(seen - basis.flange[:, :3, 3], axis=1).max())
-        elsewhere = PlacedPoint.of(fit.views.mount, known, installed, distance_m, basis.workspace, tool_m)
+        tool_m = farthest_tool_m(fit.views.mount, installed, point, basis.flange)
+        elsewhere = PlacedPoint.of(fit.views.mount, known, installed, point, basis.workspace, tool_m)
         workspace = elsewhere.mean_square(known.covariance, known.noise)
 
     def with_views_times(factor: float) -> float:
-        covariance = _known(found, _with_views_times(fit, found, factor)).covariance + told
+        covariance = known_errors(found, _with_views_times(fit, found, factor)).covariance + told
         return min(at_recorded.mean_square(covariance, known.noise), square)
 
     used = max(int(found.used.sum()), 1)
@@ -92,13 +98,13 @@ def corrected_error_mm(fit: CellFit, arm: ArmPostures, distance_m: float) -> flo
     found = fit.estimate
     count = len(arm.chain.link_errors)
     used = found.used
-    known = _known(found, found.covariance)
+    known = known_errors(found, found.covariance)
     errors = known.errors.copy()
     errors[:count] = 0.0
     corrected = arm.chain.with_errors(known.errors[:count]).forward(arm.joints_rad[used])
-    postures = _postures(corrected, fit.observed.by_arm_errors[used])
+    postures = recorded_postures(corrected, fit.observed.by_arm_errors[used])
     point = PlacedPoint.of(
-        fit.views.mount, replace(known, errors=errors), found.state.X, distance_m, postures
+        fit.views.mount, replace(known, errors=errors), found.state.X, on_axis(distance_m), postures
     )
     return _mm(point.mean_square(known.covariance, known.noise))
 
@@ -106,13 +112,15 @@ def corrected_error_mm(fit: CellFit, arm: ArmPostures, distance_m: float) -> flo
 def uncorrected_error_mm(fit: CellFit, installed: Array, distance_m: float) -> float:
     """Compute the error by the controller's flanges, beside X̂ = `installed` (4, 4)."""
     found = fit.estimate
-    known = _known(found, found.covariance)
-    postures = _postures(fit.views.base_from_flange[found.used], fit.observed.by_arm_errors[found.used])
-    point = PlacedPoint.of(fit.views.mount, known, installed, distance_m, postures)
+    known = known_errors(found, found.covariance)
+    postures = recorded_postures(
+        fit.views.base_from_flange[found.used], fit.observed.by_arm_errors[found.used]
+    )
+    point = PlacedPoint.of(fit.views.mount, known, installed, on_axis(distance_m), postures)
     return _mm(point.mean_square(known.covariance, known.noise))
 
 
-def _postures(flange: Array, by_arm_errors: Array) -> Postures:
+def recorded_postures(flange: Array, by_arm_errors: Array) -> Postures:
     """Part the motion (n, 6, q + b) by errors of arm and bracket: a bracket's are the last."""
     count = max(by_arm_errors.shape[2] - len(FLEX), 0)
     return Postures(flange, by_arm_errors[..., :count], by_arm_errors[..., count:])
@@ -127,7 +135,7 @@ def _basis(fit: CellFit) -> _Basis:
             estimate=fit.estimate,
             by_arm_errors=fit.observed.by_arm_errors[used],
             flange=flanges[used],
-            workspace=_elsewhere(fit.arm, gravity),
+            workspace=workspace_postures(fit.arm, gravity),
             arm="learned" if fit.arm.recorded else "told",
         )
     if fit.assumed is not None:
@@ -136,21 +144,25 @@ def _basis(fit: CellFit) -> _Basis:
             estimate=fit.assumed.estimate,
             by_arm_errors=fit.assumed.observed.by_arm_errors[places],
             flange=flanges[places],
-            workspace=_elsewhere(fit.assumed.arm, gravity),
+            workspace=workspace_postures(fit.assumed.arm, gravity),
             arm="assumed",
         )
     used = fit.estimate.used
     return _Basis(fit.estimate, fit.observed.by_arm_errors[used], flanges[used], None, "assumed")
 
 
-def _elsewhere(arm: ArmPostures, mean_gravity: Array) -> Postures:
-    """Draw postures where the arm may work next."""
+def workspace_postures(arm: ArmPostures, mean_gravity: Array) -> Postures:
+    """Draw postures where the arm may work next.
+
+    mean_gravity: (3,) of the recorded views, in the flange: what a bracket bends there belongs to X.
+    """
     joints = sample_around(arm.chain, arm.joints_rad)
     flange = arm.chain.forward(joints)
     return Postures(flange, arm.chain.by_links(joints), flex_motion(flange, mean_gravity))
 
 
-def _known(found: Estimate, covariance: Array) -> KnownErrors:
+def known_errors(found: Estimate, covariance: Array) -> KnownErrors:
+    """Return what a fit knows of X and the arm's errors; covariance: (G, G) as that of the fit, or less."""
     errors = Layout.of(found.state).arm_errors
     places = np.append(np.arange(6), np.arange(errors.start, errors.stop))
     return KnownErrors(
@@ -179,7 +191,7 @@ def _taken_by(found: Estimate, parts: list[slice]) -> Array:
     taken = np.zeros_like(covariance)
     for part in parts:
         taken = taken + _explained(covariance - taken, part)
-    return _known(found, taken).covariance
+    return known_errors(found, taken).covariance
 
 
 def _explained(covariance: Array, part: slice) -> Array:

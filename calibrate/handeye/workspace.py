@@ -1,25 +1,15 @@
-"""Errors of points in base over the arm's workspace, with the arm's corrected table and without it.
-
-A point on the camera's axis or near it (eye-in-hand), or one that the flange carries (eye-to-hand), is placed
-by X and the flange. A rigid motion of all points together (of base, or of what the flange carries) counts as
-no error: nothing in a recording tells it from another place of the board.
-"""
+"""Postures where an arm may work: over its whole reach, or around those that were recorded."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from calibrate.arms.chain import Chain
 from calibrate.arms.kinematics import MODELS, RobotModel, forward, inverse_many
-from recordings.geometry import Array, matrix_from_quaternion, pose, skew
-from recordings.schema.messages import Mount
+from recordings.geometry import Array, matrix_from_quaternion, pose
 
 _SHELL = (0.35, 0.9)
 """Reach of the sampled flange positions, as shares of upper arm and forearm together."""
-SPREAD = 0.25 * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
-"""Directions of points about the camera's axis, radians, itself first: there a roll of X has no effect."""
 
 
 def sample_workspace(model: RobotModel, like_rad: Array, count: int = 400) -> Array:
@@ -86,92 +76,3 @@ def _branch(model: RobotModel, joints_rad: Array) -> int:
     off = np.abs(np.angle(np.exp(1j * (solutions - joints_rad[owner])))).max(axis=1)
     same = branch[off < 0.1]
     return int(np.bincount(same, minlength=8).argmax())
-
-
-@dataclass(frozen=True, eq=False)
-class Workspace:
-    """Derivatives of points in base by X and by the errors of the arm's links."""
-
-    by_camera: Array
-    """(m, 6) by X"""
-    by_arm_errors: Array
-    """(m, q)"""
-    by_rigid: Array
-    """(m, 6) the motion that counts as no error."""
-
-    @classmethod
-    def of(
-        cls,
-        mount: Mount,
-        F: Array,
-        motion: Array,
-        X: Array,
-        Y: Array,
-        distance_m: float,
-        spread: Array = SPREAD[:1],
-    ) -> Workspace:
-        """Linearise at X and Y (4, 4); `distance_m` from the camera (eye-in-hand).
-
-        F: base_from_flange (n, 4, 4); motion: (n, 6, q) of the flange, in base, by each error of the arm.
-        spread: (k, 2) directions of the points about the camera's axis, or places about the board's origin.
-        """
-        R_F = F[:, None, :3, :3]
-        in_hand = mount == "eye-in-hand"
-        if in_hand:
-            carried = X
-            points = np.column_stack([distance_m * np.tan(spread), np.full(len(spread), distance_m)])
-        else:
-            carried = Y
-            points = np.column_stack([0.2 * spread, np.zeros(len(spread))])
-        lever = points @ carried[:3, :3].T  # (k, 3) in the flange
-        arm = R_F @ (lever + carried[:3, 3])[None, :, :, None]  # (n, k, 3, 1) in base
-        at = F[:, None, :3, 3] + arm[..., 0]
-        rows = (len(F) * len(points) * 3, -1)
-        T = motion[:, None, :3, :] - skew(arm[..., 0]) @ motion[:, None, 3:, :]
-        eye = np.broadcast_to(np.eye(3), (len(F), len(points), 3, 3))
-        about_base = np.concatenate([eye, -skew(at)], axis=-1)
-        turn = -skew(np.broadcast_to(lever, (len(F), len(points), 3)))
-        about_flange = R_F @ np.concatenate([eye, turn], axis=-1)
-        # X turns about its own origin; eye-to-hand it carries the camera's side of every point.
-        about_camera = -np.concatenate([eye, -skew(at - X[:3, 3])], axis=-1)
-        by_camera, by_rigid = (about_flange, about_base) if in_hand else (about_camera, about_flange)
-        return cls(by_camera.reshape(rows), T.reshape(rows), by_rigid.reshape(rows))
-
-    def __add__(self, other: Workspace) -> Workspace:
-        """Combine the points of both; each workspace as a whole has the same weight."""
-        ratio = np.sqrt(len(self.by_camera) / len(other.by_camera))
-        return Workspace(
-            *(
-                np.concatenate([getattr(self, name), ratio * getattr(other, name)])
-                for name in ("by_camera", "by_arm_errors", "by_rigid")
-            )
-        )
-
-    def for_uncorrected(self) -> Array:
-        """Matrix (6, q): times the arm's errors, the change of X that is best for the uncorrected arm."""
-        J = np.concatenate([self.by_camera, self.by_rigid], axis=1)
-        return np.asarray(np.linalg.lstsq(J, self.by_arm_errors, rcond=None)[0][:6])
-
-    def quadratic(self) -> Array:
-        """Matrix K (6 + q, 6 + q): a point's mean squared error is trace(K C), C that of [X, errors]."""
-        J = self._beside_rigid(np.concatenate([self.by_camera, self.by_arm_errors], axis=1))
-        return np.asarray(3 * J.T @ J / len(J))
-
-    def among(self, size: int) -> Array:
-        """Embed `quadratic` into (size, size), in `handeye.information`'s order: X first, the links last."""
-        K = np.zeros((size, size))
-        places = np.concatenate([np.arange(6), np.arange(size - self.by_arm_errors.shape[1], size)])
-        K[np.ix_(places, places)] = self.quadratic()
-        return K
-
-    def rms_m(self, covariance: Array) -> float:
-        """Compute a point's rms error, metres, from a covariance (6 + q, 6 + q) of [X, errors]."""
-        return float(np.sqrt(np.trace(self.quadratic() @ covariance)))
-
-    def error_m(self, shift: Array, errors: Array) -> float:
-        """Compute a point's rms error, metres, for X wrong by `shift` (6,) and errors (q,) ignored."""
-        off = self._beside_rigid(self.by_camera @ shift - self.by_arm_errors @ errors)
-        return float(np.sqrt(3 * (off**2).mean()))
-
-    def _beside_rigid(self, J: Array) -> Array:
-        return np.asarray(J - self.by_rigid @ np.linalg.lstsq(self.by_rigid, J, rcond=None)[0])

@@ -17,8 +17,15 @@ from calibrate.handeye.information import (
     view_information,
 )
 from calibrate.handeye.noise_scales import MeasurementNoise
+from calibrate.handeye.placed_point import (
+    KnownErrors,
+    PlacedPoint,
+    Postures,
+    farthest_tool_m,
+    on_axis,
+)
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.workspace import Workspace, sample_workspace
+from calibrate.handeye.workspace import sample_workspace
 from calibrate.views.projection import intrinsics_names
 from recordings.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel
@@ -99,15 +106,27 @@ def camera_objective(
 
 
 def arm_objective(layout: CellLayout, free_intrinsics: bool, joints_rad: Array) -> Objective:
-    """Make the objective for X and the arm's links, over the workspace that postures (n, 6) stand for."""
+    """Make the objective for X and the arm's links, over the arm's whole workspace.
+
+    joints_rad: (n, 6) postures of the branch to work in. It is the error of a placed point by the corrected
+    arm, at the working distance.
+    """
     prior = prior_information(
         layout.camera, not free_intrinsics, BoardTolerance.of(layout.board), LINK_ERROR_MM
     )
-    chain, room = chain_of(layout.geometry.model), sample_workspace(layout.geometry.model, joints_rad)
-    over = Workspace.of(
-        layout.mount, chain.forward(room), chain.by_links(room), layout.X, layout.Y, layout.working_distance_m
-    )
-    return Objective(prior, over.among(len(prior)))
+    chain = chain_of(layout.geometry.model)
+    room = sample_workspace(layout.geometry.model, joints_rad)
+    by_links = chain.by_links(room)
+    count = by_links.shape[2]
+    elsewhere = Postures(chain.forward(room), by_links, np.zeros((len(room), 6, 0)))
+    exact = KnownErrors(layout.X, np.zeros(count), np.zeros((6 + count, 6 + count)), np.zeros(2), 1.0)
+    point = on_axis(layout.working_distance_m)
+    tool_m = farthest_tool_m(layout.mount, layout.X, point, chain.forward(joints_rad))
+    placed = PlacedPoint.of(layout.mount, exact, layout.X, point, elsewhere, tool_m)
+    weights = np.zeros_like(prior)
+    places = np.concatenate([np.arange(6), np.arange(len(prior) - count, len(prior))])
+    weights[np.ix_(places, places)] = placed.quadratic()
+    return Objective(prior, weights)
 
 
 def choose(

@@ -13,10 +13,12 @@ from benchmarks.scene import random_rotation
 from calibrate.arms.chain import chain_of
 from calibrate.arms.kinematics import MODELS, forward, with_near_axes
 from calibrate.handeye.arm_table import CorrectedArm
+from calibrate.handeye.placed_point import KnownErrors, PlacedPoint, Postures, farthest_tool_m
 from calibrate.handeye.solution import Solution, UncorrectedArm
 from calibrate.handeye.solve import solve_views
 from calibrate.handeye.uncertainty import Inverse, inverse_of
-from calibrate.handeye.workspace import Workspace, sample_workspace
+from calibrate.handeye.uncorrected_arm import best_change_of_X
+from calibrate.handeye.workspace import sample_around
 from calibrate.pipeline.solved import Solved
 from recordings.geometry import Array, difference, inverse, perturb, pose
 from tests.calibrate.cells import MOUNTS, QUICK
@@ -122,40 +124,36 @@ def test_far_axes_are_restated_and_the_flange_stays(seed: int) -> None:
 
 
 @MOUNTS
-def test_workspace_derivatives_are_those_of_the_points(mount: str) -> None:
-    """Error of a point by X and by the table: against moving both, to first order."""
-    rng = np.random.default_rng(8)
-    joints = rng.uniform(-2, 2, (4, 6))
-    X, Y = (pose(random_rotation(rng), 0.3 * rng.normal(size=3)) for _ in range(2))
-    room = Workspace.of(mount, forward(UR10, joints), CHAIN.by_links(joints), X, Y, 0.5)
-    shift, errors = 1e-5 * rng.normal(size=6), 1e-5 * rng.normal(size=30)
-    true = CHAIN.with_errors(errors).forward(joints)
-    said, wrong = forward(UR10, joints), perturb(X, shift)
-    ahead = np.array([0.0, 0.0, 0.5, 1.0])
-    if mount == "eye-in-hand":
-        off = (said @ wrong @ ahead - true @ X @ ahead)[:, :3]
-    else:
-        held = Y[:, 3]
-        off = (said @ held - wrong @ inverse(X) @ true @ held)[:, :3]
-    linear = room.by_camera @ shift - room.by_arm_errors @ errors
-    np.testing.assert_allclose(linear.reshape(-1, 3), off, atol=3e-9)
-
-
-def test_the_uncorrected_arm_gets_the_best_x_over_its_poses() -> None:
+def test_the_uncorrected_arm_gets_the_x_that_places_points_best(mount: str) -> None:
+    """Against every nudge of it, by the mean of |e|² over the recorded postures and the workspace."""
     rng = np.random.default_rng(2)
-    like = rng.uniform(-1, 1, (5, 6)) + np.array([0, -1.5, 1.5, -1.5, -1.5, 0])
-    joints = sample_workspace(UR10, like, 100)
-    X = pose(random_rotation(rng), [0.05, 0.02, 0.1])
-    beside = np.array([[0, 0], [0.2, 0.2], [0.2, -0.2], [-0.2, 0.2]])
-    room = Workspace.of(
-        "eye-in-hand", forward(UR10, joints), CHAIN.by_links(joints), X, np.eye(4), 0.5, beside
+    recorded = rng.uniform(-0.6, 0.6, (12, 6)) + np.array([0, -1.5, 1.5, -1.5, -1.5, 0])
+    around = sample_around(CHAIN, recorded, 100)
+    no_bracket = np.zeros((100, 6, 0))
+    near, far = (
+        Postures(CHAIN.forward(q), CHAIN.by_links(q), no_bracket[: len(q)]) for q in (recorded, around)
     )
+    X = pose(random_rotation(rng), [0.05, 0.02, 0.1])
+    if mount == "eye-to-hand":
+        X = near.flange[0] @ X
     errors = 3e-4 * rng.normal(size=30)
-    best = room.for_uncorrected() @ errors
-    least = room.error_m(best, errors)
-    assert least < room.error_m(np.zeros(6), errors)
+    exact = KnownErrors(X, errors, np.zeros((36, 36)), np.zeros(2), 1.0)
+
+    def missed(change: Array) -> float:
+        installed = perturb(X, change)
+        total = 0.0
+        for x, y in [(0.0, 0.0), (0.25, 0.25), (0.25, -0.25), (-0.25, 0.25), (-0.25, -0.25)]:
+            point = np.array([np.tan(x), np.tan(y), 1.0]) * 0.5
+            tool_m = farthest_tool_m(mount, X, point, near.flange)
+            for at, reach_m in ((near, None), (far, tool_m)):
+                total += PlacedPoint.of(mount, exact, installed, point, at, reach_m).systematic()
+        return total
+
+    best = best_change_of_X(mount, X, 0.5, near, far) @ errors
+    least = missed(best)
+    assert least < missed(np.zeros(6))
     for nudge in 1e-4 * rng.normal(size=(20, 6)):
-        assert least < room.error_m(best + nudge, errors)
+        assert least < missed(best + nudge)
 
 
 def test_stated_covariance_of_the_corrected_flange_holds(worn: Worn, solved: Solution) -> None:

@@ -52,7 +52,7 @@ def test_known_errors_move_the_point_as_the_definition_says(mount: Mount, seed: 
     at, X = postures(rng), poses(rng, 1)[0]
     errors = SMALL * rng.normal(size=6)
     installed = perturb(X, SMALL * rng.normal(size=6))
-    point = PlacedPoint.of(mount, known(X, errors, np.zeros((12, 12)), np.zeros(2)), installed, 0.5, at)
+    point = PlacedPoint.of(mount, known(X, errors, np.zeros((12, 12)), np.zeros(2)), installed, P, at)
     expected = by_definition(mount, at, errors, installed, X)[:, :3]
     assert np.abs(point.mean - expected).max() < 1e-4 * SMALL
     assert point.systematic() == pytest.approx((expected**2).sum(axis=1).mean(), rel=1e-3)
@@ -66,7 +66,7 @@ def test_what_is_uncertain_adds_up_to_what_draws_of_it_miss_by(mount: Mount) -> 
     root = SMALL * rng.normal(size=(12, 12))
     errors = SMALL * rng.normal(size=6)
     told = known(X, errors, root @ root.T, np.zeros(2))
-    point = PlacedPoint.of(mount, told, X, 0.5, at)
+    point = PlacedPoint.of(mount, told, X, P, at)
     missed = []
     for _ in range(4000):
         off = root @ rng.normal(size=12)
@@ -84,7 +84,7 @@ def test_what_the_arm_does_differently_each_time_counts_at_each_posture(
     rng = np.random.default_rng(3)
     at, X = postures(rng), poses(rng, 1)[0]
     noise = np.array([1e-4, 0.0])
-    point = PlacedPoint.of(mount, known(X, np.zeros(6), np.zeros((12, 12)), noise), X, 0.5, at)
+    point = PlacedPoint.of(mount, known(X, np.zeros(6), np.zeros((12, 12)), noise), X, P, at)
     assert point.mean_square(np.zeros((12, 12)), noise) == pytest.approx(postures_that_err * 3 * 1e-8)
 
 
@@ -100,7 +100,7 @@ def test_an_error_of_base_moves_point_and_tool_alike() -> None:
     )
     at = Postures(flange, of_base, np.zeros((6, 6, 0)))
     told = known(moved @ X, off, np.zeros((12, 12)), np.zeros(2))
-    point = PlacedPoint.of("eye-to-hand", told, X, 0.5, at)
+    point = PlacedPoint.of("eye-to-hand", told, X, P, at)
     assert np.abs(point.mean).max() < 1e-4 * SMALL
 
 
@@ -116,8 +116,8 @@ def test_no_point_is_placed_from_where_no_tool_reaches_it(mount: Mount) -> None:
     at = Postures(flange, errs, np.zeros((5, 6, 0)))
     X = np.eye(4)
     told = known(X, np.array([1e-3]), np.zeros((7, 7)), np.zeros(2))
-    far = PlacedPoint.of(mount, told, X, 0.5, at, tool_m=9.0).mean
-    near = PlacedPoint.of(mount, told, X, 0.5, at, tool_m=1.0).mean
+    far = PlacedPoint.of(mount, told, X, P, at, tool_m=9.0).mean
+    near = PlacedPoint.of(mount, told, X, P, at, tool_m=1.0).mean
     assert np.abs(far).max() > 0.0
     # Eye-in-hand the point that is seen from there is placed from there, and misses by the same on both ways.
     assert np.abs(near).max() == 0.0
@@ -131,7 +131,7 @@ def test_a_point_that_no_tool_reaches_is_placed_from_the_nearest_flange() -> Non
     at = Postures(flange, motion, np.zeros((3, 6, 0)))
     X = np.eye(4)
     told = known(X, np.array([1e-3]), np.zeros((7, 7)), np.zeros(2))
-    point = PlacedPoint.of("eye-to-hand", told, X, 0.5, at, 1.0)
+    point = PlacedPoint.of("eye-to-hand", told, X, P, at, 1.0)
     assert np.linalg.norm(point.mean, axis=1) == pytest.approx([1e-3])
 
 

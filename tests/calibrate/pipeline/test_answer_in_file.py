@@ -63,7 +63,7 @@ def test_the_installed_pose_is_the_one_for_the_arm_as_it_is(solved_real: SolvedR
     spread = NUMBERS.normal(size=(6, 6))
     covariance = 1e-8 * spread @ spread.T
     stated = Arm(True, 9.0, 0.3, [])
-    errors = ArmErrors(stated, UncorrectedArm(other, covariance, 0.0007))
+    errors = ArmErrors(stated, UncorrectedArm(other, covariance))
     found = written(solved_real, replace(solution, fit=replace(solution.fit, arm=errors)))
     np.testing.assert_allclose(found.transform.matrix, other, atol=1e-12)
     np.testing.assert_allclose(found.covariance, covariance)

@@ -8,7 +8,7 @@ PYTHON ?= $(or $(SYSTEM_PYTHON),python3)
 VENV_FLAGS := $(if $(SYSTEM_PYTHON),--system-site-packages,)
 READY := $(VENV)/.ready
 
-.PHONY: help venv demo demo-gige test foreign check bench pages docs soak install install-files uninstall clean
+.PHONY: help venv demo demo-gige test foreign check bench pages docs snapshots soak install install-files uninstall clean
 help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
@@ -70,6 +70,9 @@ pages: $(READY)  ## the pages of docs/ that are made from the sources
 
 docs: $(READY)  ## the books as a site in site/, to be read without a server
 	$(BIN)/mkdocs build --strict -d site && echo "site/index.html; with its search: python3 -m http.server --bind 127.0.0.1 -d site"
+
+snapshots: $(READY)  ## write the snapshots of the screens anew; git diff shows what changed
+	SNAPSHOTS=renew $(BIN)/python -m pytest -q -p no:xdist tests/tui/test_snapshots.py
 
 soak: $(READY)  ## the long runs that CI shortens
 	$(BIN)/python -m pytest -m soak --timeout 3600

@@ -30,6 +30,11 @@ class Word(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"ret
     """Words that are not used for it."""
 
     @property
+    def title(self) -> str:
+        """The word at the beginning of a line."""
+        return self.term[:1].upper() + self.term[1:]
+
+    @property
     def plain_meaning(self) -> str:
         """The meaning without the marks of a page."""
         return re.sub(r"[*`]", "", self.meaning)

@@ -181,8 +181,7 @@ class _Figure(NamedTuple):
 
 
 def _title(name: str) -> str:
-    term = words_of_gates()[name].term
-    return term[:1].upper() + term[1:]
+    return words_of_gates()[name].title
 
 
 def _measured(solution: Solution, clock_bound_s: float | None) -> Iterator[_Figure]:

@@ -6,6 +6,7 @@ from datetime import datetime
 
 from textual.app import ComposeResult
 from textual.content import Content
+from textual.theme import Theme
 from textual.widgets import RichLog
 
 from station.cell.status import Event
@@ -35,6 +36,15 @@ class LogScreen(StationScreen):
 
     def body(self) -> ComposeResult:
         yield RichLog(id="log", wrap=True, max_lines=2000, min_width=0)
+
+    def on_mount(self) -> None:
+        self.app.theme_changed_signal.subscribe(self, self._draw_again)
+
+    def _draw_again(self, theme: Theme) -> None:
+        """Write all lines in the colours of another theme."""
+        self.query_one("#log", RichLog).clear()
+        self._last = None
+        self.show(self.known)
 
     def show(self, known: Known) -> None:
         super().show(known)

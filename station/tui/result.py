@@ -266,7 +266,7 @@ class ResultScreen(StationScreen):
     def on_data_table_row_selected(self, event: DataTable.RowSelected) -> None:
         """Explain a check at Enter."""
         _, text, word = self._rows[event.cursor_row]
-        self.app.push_screen(Explained(word.term, text, [word]))
+        self.app.push_screen(Explained(word.title, text, [word]))
 
     def action_explain_words(self) -> None:
         """Explain the words of the verdict and of the evidence."""

@@ -60,10 +60,16 @@ class Rows(DataTable[object]):
     def __init__(self, *columns: str, id: str) -> None:
         super().__init__(id=id, cursor_type="row")
         self.add_columns(*columns)
+        self._cells: Sequence[tuple[Content, ...]] = ()
         self._texts: list[list[Text]] = []
+
+    def on_mount(self) -> None:
+        # A table keeps the colours that its texts had when they were given to it.
+        self.app.theme_changed_signal.subscribe(self, lambda _: self.show(self._cells))
 
     def show(self, cells: Sequence[tuple[Content, ...]]) -> None:
         """Draw these rows, unless they stand there. The cursor stays on its line."""
+        self._cells = cells
         texts = [[rich_text(cell) for cell in row] for row in cells]
         if texts == self._texts:
             return

@@ -25,7 +25,7 @@ GATES = tuple(msgspec.structs.asdict(GateLimits(**ADVICE)))
 
 def with_every_gate() -> Calibration:
     gates = [
-        Gate.measured(name, words_of_gates()[name].term, 1.0, "≤", 2.0, "", "Do it.")
+        Gate.measured(name, words_of_gates()[name].title, 1.0, "≤", 2.0, "", "Do it.")
         for name in GATES
         if name in words_of_gates()
     ]

@@ -33,10 +33,11 @@ from station.cell.status import (
 )
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import CellStep
-from station.protocol.verbs import Check
+from station.protocol.results import Installed, Kept, Result
+from station.protocol.verbs import Check, ResultData, SessionsData
+from station.tui.app import StationApp
 from station.tui.dialogs import ConfirmFinish, ConfirmMotion, JobScreen, Reason
 from station.tui.help import Explained, Help
-from station.tui.installed import Installed, Kept, Result
 from station.tui.jobs import install_question
 from station.tui.new_cell import NewCell
 from station.tui.new_cell_steps import PAGES
@@ -98,20 +99,6 @@ def one_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Input, "cursor_blink", False, raising=False)
 
 
-@dataclass(frozen=True)
-class Shot:
-    """A state of the station, and what is opened on it."""
-
-    status: StationStatus
-    mode: str = "capture"
-    known: dict[str, Any] = field(default_factory=dict)
-    """What the screen knows besides the status."""
-    over: Callable[[Screen[Any]], Screen[Any]] | None = None
-    """Makes a window over the screen."""
-    keys: tuple[str, ...] = ()
-    """Pressed at last."""
-
-
 def fresh() -> StationStatus:
     return in_session(idle(), name="", poses=())
 
@@ -165,6 +152,23 @@ MISSING = (
 READY = tuple(msgspec.structs.replace(check, state="ok", remedy="") for check in MISSING)
 
 
+@dataclass(frozen=True)
+class Shot:
+    """A state of the station, and what is opened on it."""
+
+    status: StationStatus
+    mode: str = "capture"
+    checks: tuple[Check, ...] = READY
+    result: Result | None = None
+    sessions: tuple[Kept, ...] = ()
+    known: dict[str, Any] = field(default_factory=dict)
+    """What the screen knows besides what the daemon tells."""
+    over: Callable[[Screen[Any]], Screen[Any]] | None = None
+    """Makes a window over the screen."""
+    keys: tuple[str, ...] = ()
+    """Pressed at last."""
+
+
 def solved(gates: list[Gate], rejected: Sequence[RejectedView] = ()) -> Calibration:
     quality = msgspec.structs.replace(
         GOOD.quality,
@@ -189,20 +193,20 @@ TAKEN_OUT = Validity(
     ValidityReason("withdrawn", "the camera was changed"),
 )
 CHECKED = CheckEntry(NOON_NS / 1e9, 1, "s-2", True, (0.0002, 0.0, 0.0, 0.0, 0.0, 0.0), 3.1, 12.6, 0.79)
+ERROR = ("± 0.53 mm (1σ)", "at 500 mm")
+
+
+def kept(day: int, views: int, sealed: bool = True, check: bool = False) -> SessionSummary:
+    name = f"202609{day}-101500-cell"
+    return SessionSummary(name, f"/s/{name}", f"/s/{name}/r.mcap", views, check, sealed, "")
+
+
 KEPT = (
-    Kept(SessionSummary("20260922-091500-cell", "/s/3", "/s/3/r.mcap", 12, False, False, "")),
-    Kept(SessionSummary("20260921-150000-cell", "/s/2", "/s/2/r.mcap", 8, True, True, ""), check=CHECKED),
-    Kept(
-        SessionSummary("20260920-101500-cell", "/s/1", "/s/1/r.mcap", 25, False, True, "/s/1/c.yaml"),
-        PASSED,
-        "INSTALLED",
-        verdict="PASS",
-    ),
-    Kept(
-        SessionSummary("20260919-101500-cell", "/s/0", "/s/0/r.mcap", 25, False, True, "/s/0/c.yaml"),
-        FAILED,
-        verdict="FAIL",
-    ),
+    Kept(kept(22, 12, sealed=False)),
+    Kept(kept(21, 8, check=True), check=CHECKED),
+    Kept(kept(20, 25), "PASS", "INSTALLED", ERROR),
+    Kept(kept(19, 25), "FAIL", "", ERROR),
+    Kept(kept(18, 25)),
 )
 EVENTS = tuple(
     Event(NOON_NS + 7_000_000_000 * number, level, text, pose)
@@ -219,14 +223,14 @@ EVENTS = tuple(
 
 def after(result: Result, mode: str = "result", **more: Any) -> Shot:
     recorded = planned(captured=25, recording="/s/1/r.mcap")
-    return Shot(recorded, mode, {"result": result, "sessions": KEPT, "checks": READY}, **more)
+    return Shot(recorded, mode, result=result, sessions=KEPT, **more)
 
 
 GOOD_RESULT = Result("/s/1/c.yaml", PASSED)
 HANDS = msgspec.structs.replace(by_hand(4, still=0.6, moves="the image moves", after_mm=0.9))
 SHOTS: dict[str, Shot] = {
-    "connect-missing": Shot(fresh(), "connect", {"checks": MISSING}),
-    "connect-ready": Shot(fresh(), "connect", {"checks": READY}),
+    "connect-missing": Shot(fresh(), "connect", checks=MISSING),
+    "connect-ready": Shot(fresh(), "connect"),
     "connect-no-robot": Shot(
         with_robot(
             msgspec.structs.replace(
@@ -235,7 +239,7 @@ SHOTS: dict[str, Shot] = {
             state=None,
         ),
         "connect",
-        {"checks": MISSING},
+        checks=MISSING,
     ),
     "plan-none": Shot(fresh(), "plan"),
     "plan-25": Shot(planned(), "plan"),
@@ -279,7 +283,7 @@ SHOTS: dict[str, Shot] = {
     "result-installed": after(Result("/s/1/c.yaml", PASSED, Installed(PASSED, drift=(CHECKED,)))),
     "result-withdrawn": after(Result("/s/1/c.yaml", PASSED, Installed(PASSED, validity=TAKEN_OUT))),
     "result-unreadable": after(Result("/s/1/c.yaml", problem="calibration.yaml: damaged, or edited by hand")),
-    "sessions-none": Shot(fresh(), "sessions", {"sessions": ()}),
+    "sessions-none": Shot(fresh(), "sessions"),
     "sessions": after(GOOD_RESULT, "sessions"),
     "log": Shot(msgspec.structs.replace(planned(), events=EVENTS), "log"),
     "help": Shot(fresh(), over=Help),
@@ -300,20 +304,33 @@ SHOTS: dict[str, Shot] = {
 }
 
 
+def tell(link: FakeLink, shot: Shot) -> None:
+    """Let the daemon answer with what the shot shows."""
+    link.same_image = True
+    link.answers["doctor"] = shot.checks
+    link.answers["result"] = ResultData(None if shot.result is None else msgspec.to_builtins(shot.result))
+    link.answers["sessions"] = SessionsData(tuple(msgspec.to_builtins(kept) for kept in shot.sessions))
+    link.show(shot.status)
+
+
+def knows(app: StationApp, shot: Shot) -> bool:
+    """Tell whether the daemon's answers have come."""
+    now = app.known
+    has_result = (now.result is None) is (shot.result is None)
+    has_checks = now.works or now.checks == shot.checks
+    return now.status == shot.status and now.sessions == shot.sessions and has_result and has_checks
+
+
 @pytest.mark.parametrize("name", SHOTS)
 async def test_a_screen_looks_as_it_did(link: FakeLink, name: str) -> None:
     shot = SHOTS[name]
-    link.root, link.same_image = None, True
-    known = {"checks": READY} | shot.known
-    link.answers["doctor"] = known["checks"]
-    link.show(shot.status)
+    tell(link, shot)
     app = app_on(link)
     async with app.run_test(size=SIZES[0], notifications=True) as pilot:
-        await until(pilot, lambda: app.known.status == shot.status)
-        await until(pilot, lambda: app.known.checks == known["checks"] or app.known.works)
+        await until(pilot, lambda: knows(app, shot))
         await app.switch_mode(shot.mode)
         await until(pilot, lambda: app.screen.query("#content"))
-        app.known = replace(app.known, **known)
+        app.known = replace(app.known, **shot.known)
         await until(pilot, lambda: app.screen.known is app.known)
         if shot.over is not None:
             await app.push_screen(shot.over(app.screen))
@@ -328,12 +345,11 @@ async def test_long_work_looks_as_it_did(
     (tmp_path / "some_job.py").write_text(
         "print('25 views are read'); print('FAIL: rotation_deg'); raise SystemExit(1)"
     )
-    shot = after(GOOD_RESULT)
-    link.root, link.same_image = None, True
-    link.show(shot.status)
+    shot = Shot(planned(captured=25, recording="/s/1/r.mcap"))
+    tell(link, shot)
     app = app_on(link)
     async with app.run_test(size=SIZES[0]) as pilot:
-        await until(pilot, lambda: app.known.status == shot.status)
+        await until(pilot, lambda: knows(app, shot))
         work = JobScreen("Solving 20260920-101500-cell", "some_job")
         await app.push_screen(work)
         await until(pilot, lambda: work.NEXT.label == "Read the result")

@@ -22,6 +22,7 @@ from textual.app import ComposeResult
 from textual.geometry import Size
 from textual.reactive import reactive
 from textual.strip import Strip
+from textual.theme import Theme
 from textual.widget import Widget
 
 from station.cell.status import OLD_S
@@ -100,6 +101,14 @@ class PreviewPane(Widget):
         self._rows_size = Size(0, 0)
         self._next_s = 0.0
         """Time before which no sharp image is drawn."""
+
+    def on_mount(self) -> None:
+        self.app.theme_changed_signal.subscribe(self, self._draw_in)
+
+    def _draw_in(self, theme: Theme) -> None:
+        """Draw again, in the colours of another theme."""
+        self._rows_size = Size(0, 0)
+        self.refresh()
 
     def compose(self) -> ComposeResult:
         if self.sharp is not None:

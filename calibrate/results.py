@@ -139,6 +139,34 @@ class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
     """The same of its orientation."""
 
 
+class AllViews(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What the same solve of all views says, where a person excluded some from the result."""
+
+    problem: str = ""
+    """Why all views together give no result; empty: they give one."""
+    error_mm: float | None = None
+    """Its placed-point error, as `predicted_error_mm`."""
+    holdout_m: float | None = None
+    """Its hold-out's mean translation error, as `HoldoutScore.e_t_m`."""
+    failed: list[str] = []
+    """Ids of the gates that it fails."""
+    shift: tuple[float, ...] = ()
+    """(6,) [δt (m), δφ (rad)] of the installed X against that of all views, in X's parent frame."""
+    views: list[ViewQuality] = []
+    """The excluded views in it; one that it rejected is not here."""
+    weights: list[ViewWeight] = []
+    """Of the excluded views; 0: it rejected this one, too."""
+
+
+class Excluded(msgspec.Struct, frozen=True):
+    """Views that a person excluded from a solve, and what all views say."""
+
+    views: list[int]
+    """Their pose numbers from 0."""
+    who: str
+    all_views: AllViews
+
+
 class HoldoutScore(msgspec.Struct, frozen=True, omit_defaults=True):
     """Equations 24 to 26 of the paper on pairs that took no part in the fit."""
 

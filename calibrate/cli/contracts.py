@@ -15,6 +15,7 @@ from calibrate.results import (
     Certificate,
     CrossValidation,
     DriftFigures,
+    Excluded,
     Gate,
     HoldoutScore,
     MovedPoint,
@@ -44,6 +45,7 @@ class SolveJson(msgspec.Struct, frozen=True):
     session: SessionReading | None
     arm: Arm | None
     arm_table: CorrectedArm | None
+    excluded: Excluded | None
     solve_ms: float
 
 

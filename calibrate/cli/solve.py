@@ -70,7 +70,9 @@ def solve(
         typer.Option("--estimate-intrinsics", help="Estimate the intrinsics even where some are recorded"),
     ] = False,
     lens: Annotated[LensModel, typer.Option("--lens", help="Lens of estimated intrinsics")] = "plumb_bob",
-    without: Annotated[str, typer.Option(help="Poses to exclude, e.g. 3,7")] = "",
+    without: Annotated[
+        str, typer.Option(help="Poses to exclude, e.g. 3,7; written to the file, with all views to compare")
+    ] = "",
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of the board detection")] = None,
     gates: GatesFile = None,
     working_distance_mm: Annotated[
@@ -175,6 +177,7 @@ def solve_json(job: SolvedRecording) -> SolveJson:
         session=quality.session,
         arm=quality.arm,
         arm_table=found.arm_table,
+        excluded=found.excluded,
         solve_ms=job.solve_ms,
     )
 

@@ -29,6 +29,7 @@ from calibrate.handeye.arm_table import CorrectedArm, FramePose
 from calibrate.results import (
     Arm,
     BoardShape,
+    Excluded,
     Gate,
     Posterior,
     QualityFigures,
@@ -51,6 +52,8 @@ from recordings.schema.messages import (
 )
 
 FORMAT: Literal["handeye-calibration/2"] = "handeye-calibration/2"
+MOST_EXCLUDED = 0.2
+"""Share of the views that a person may exclude without being asked for a reason."""
 Verdict = Literal["PASS", "PASS WITH A REASON", "FAIL"]
 
 
@@ -174,6 +177,8 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     """The arm's corrected kinematics, where they are known; `result` does not depend on them."""
     posterior: Posterior | None = None
     """What later checks begin with; None in files that began in the first format."""
+    excluded: Excluded | None = None
+    """Views that a person left out; None: none, or in files of before only in `views.rejected`."""
 
     @property
     def transform(self) -> Transform:
@@ -187,13 +192,39 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def verdict(self) -> Verdict:
-        """FAIL by a gate; PASS WITH A REASON where a touch missed, a person overrode something else, or the
-        error is above its limit only by an arm's size that was assumed."""
+        """FAIL by a gate; PASS WITH A REASON where a touch missed, a person overrode something else, the
+        error is above its limit only by an arm's size that was assumed, or a person excluded more than a
+        fifth of the views, or views without which alone it passes."""
         if self.quality.failed:
             return "FAIL"
         assumed = any(gate.name == "predicted_error_m" and gate.over_limit for gate in self.quality.gates)
-        questioned = assumed or self.override is not None or not all(map(agrees, self.verification))
-        return "PASS WITH A REASON" if questioned else "PASS"
+        reasons = (
+            assumed,
+            self.override is not None,
+            not all(map(agrees, self.verification)),
+            self.excluded_too_many,
+            self.passes_only_without,
+        )
+        return "PASS WITH A REASON" if any(reasons) else "PASS"
+
+    @property
+    def excluded_views(self) -> list[int]:
+        """Pose numbers, from 0, of the views that a person excluded."""
+        return [view.index for view in self.views.rejected if view.kind == "by-hand"]
+
+    @property
+    def excluded_too_many(self) -> bool:
+        """Whether a person excluded more than a fifth of all views."""
+        recorded = len(self.views.used) + len(self.views.rejected)
+        return len(self.excluded_views) > MOST_EXCLUDED * recorded
+
+    @property
+    def passes_only_without(self) -> bool:
+        """Whether it passes only without the views that a person excluded."""
+        if self.excluded is None or self.quality.failed:
+            return False
+        all_views = self.excluded.all_views
+        return bool(all_views.failed or all_views.problem)
 
 
 def encode_calibration(calibration: Calibration) -> bytes:

@@ -169,6 +169,21 @@ RECORDS: dict[str, tuple[Field, ...]] = {
         Field("verification", Items(Nested("Touch")), required=False),
         Field("arm_table", OrNone(Nested("CorrectedArm")), required=False),
         Field("posterior", OrNone(Nested("Posterior")), required=False),
+        Field("excluded", OrNone(Nested("Excluded")), required=False),
+    ),
+    "Excluded": (
+        Field("views", Items(WHOLE)),
+        Field("who", TEXT),
+        Field("all_views", Nested("AllViews")),
+    ),
+    "AllViews": (
+        Field("problem", TEXT, required=False),
+        Field("error_mm", OrNone(NUMBER), required=False),
+        Field("holdout_m", OrNone(NUMBER), required=False),
+        Field("failed", Items(TEXT), required=False),
+        Field("shift", Items(NUMBER), required=False),
+        Field("views", Items(Nested("ViewQuality")), required=False),
+        Field("weights", Items(Nested("ViewWeight")), required=False),
     ),
     "FramePose": (
         Field("parent_frame", TEXT),

@@ -57,10 +57,18 @@ def figures(calibration: Calibration) -> dict[str, ShownFigure]:
     shown = {"error": replace(error, about=", ".join(filter(None, (error.about, _about_arm(quality)))))}
     if (held := quality.holdout) is not None:
         missed = f"{1000 * held.e_t_m:.3g} mm, e_R {held.e_R:.3g}"
-        shown["held_out"] = ShownFigure("held-out error", missed, f"over {len(held.pairs)} samples")
+        about = f"over {len(held.pairs)} samples"
+        excluded = calibration.excluded
+        if excluded is not None and excluded.all_views.holdout_m is not None:
+            about = f"{about}, {1000 * excluded.all_views.holdout_m:.3g} mm of all views"
+        shown["held_out"] = ShownFigure("held-out error", missed, about)
     passed = len(gates) - len(quality.failed)
     shown["gates"] = ShownFigure("quality gates", f"{passed} of {len(gates)}", "passed")
-    shown["views"] = ShownFigure("views", f"{len(views.used)}", f"used, {len(views.rejected)} rejected")
+    excluded_count = len(calibration.excluded_views)
+    about = f"used, {len(views.rejected) - excluded_count} rejected"
+    if excluded_count:
+        about = f"{about}, {excluded_count} excluded"
+    shown["views"] = ShownFigure("views", f"{len(views.used)}", about)
     if touches := calibration.verification:
         agreed = f"{sum(map(agrees, touches))} of {len(touches)}"
         shown["touch"] = ShownFigure("corners of the touch test", agreed, "as predicted")
@@ -128,9 +136,49 @@ def error_shares(calibration: Calibration) -> dict[str, float]:
 
 
 def verdict_text(calibration: Calibration) -> str:
+    head = f"{calibration.verdict}{excluded_text(calibration)}"
     if calibration.verdict == "FAIL":
-        return f"FAIL: {', '.join(gate.name for gate in calibration.quality.failed)}"
-    return f"{calibration.verdict}: {figures(calibration)['gates'].value} gates"
+        return f"{head}: {', '.join(gate.name for gate in calibration.quality.failed)}"
+    return f"{head}: {figures(calibration)['gates'].value} gates"
+
+
+def excluded_text(calibration: Calibration) -> str:
+    """Write ', 3 views excluded by a person', which stands beside the verdict; empty where none are."""
+    count = len(calibration.excluded_views)
+    return f", {count} view{'s' * (count > 1)} excluded by a person" if count else ""
+
+
+def held_out_text(calibration: Calibration) -> str:
+    """Write the held-out error without and with the views that a person excluded; empty where not known."""
+    held, excluded = calibration.quality.holdout, calibration.excluded
+    if held is None or excluded is None or excluded.all_views.holdout_m is None:
+        return ""
+    return (
+        f"Held-out error {1e3 * held.e_t_m:.3g} mm, of all views {1e3 * excluded.all_views.holdout_m:.3g} mm"
+    )
+
+
+def exclusion_sentences(calibration: Calibration) -> Iterator[str]:
+    """Yield who excluded which views, and what all views say, first without and then with them."""
+    excluded = calibration.excluded
+    if excluded is None:
+        return
+    poses = ", ".join(str(index + 1) for index in excluded.views)
+    yield f"Excluded by {excluded.who}: pose {poses}."
+    all_views, quality = excluded.all_views, calibration.quality
+    if all_views.problem:
+        yield f"All views together give no result: {all_views.problem}"
+        return
+    error_mm = quality.predicted_error_mm
+    if error_mm is not None and all_views.error_mm is not None:
+        yield f"Placed-point error {error_mm:.3g} mm, of all views {all_views.error_mm:.3g} mm."
+    if told := held_out_text(calibration):
+        yield f"{told}."
+    shift = np.array(all_views.shift)
+    turn_deg = float(np.degrees(np.linalg.norm(shift[3:])))
+    yield f"Without them the camera moves by {1e3 * np.linalg.norm(shift[:3]):.3f} mm, {turn_deg:.4f}°."
+    if all_views.failed:
+        yield f"All views together FAIL: {', '.join(all_views.failed)}."
 
 
 def override_text(override: Override) -> str:
@@ -172,9 +220,12 @@ def summary(calibration: Calibration, validity: Validity | None = None) -> Rende
     for touch in calibration.verification:
         style = "green" if agrees(touch) else "bold red"
         parts.append(Text(f"Touch test, {touch.wall}, {touch.who}: {touch_text(touch)}", style=style))
+    parts += [Text(said) for said in exclusion_sentences(calibration)]
     parts += [Text(said) for said in (*cell_sentences(calibration), *arm_sentences(calibration))]
     parts += [Text(f"! {warning}", style="yellow") for warning in calibration.quality.warnings]
     for view in calibration.views.rejected:
+        if view.kind == "by-hand" and calibration.excluded is not None:
+            continue  # said above, by whom
         parts.append(Text(f"- view {view.index + 1} ({view.name}) rejected: {view.reason}"))
     return Group(*parts)
 

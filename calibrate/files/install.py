@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -384,9 +384,23 @@ def _beside(
         found.append("It was made without pictures: no gate judged them, and the lens is not known.")
     if calibration.camera.name not in ("", camera):
         found.append(f"It is of the camera named {calibration.camera.name}, not {camera}.")
+    found += _excluded(calibration)
     found += [f"Touch test, {touch_text(t)}." for t in calibration.verification if not agrees(t)]
     withdrawn = bool(current) and current[-1].validity.state is ValidityState.WITHDRAWN
     return before, found, [] if withdrawn else _regression(calibration, before)
+
+
+def _excluded(calibration: Calibration) -> Iterator[str]:
+    """Yield what speaks against it of the views that a person excluded."""
+    count = len(calibration.excluded_views)
+    if calibration.excluded_too_many:
+        recorded = len(calibration.views.used) + len(calibration.views.rejected)
+        yield f"A person excluded {count} of {recorded} views, more than a fifth."
+    if calibration.passes_only_without and calibration.excluded is not None:
+        failed = ", ".join(calibration.excluded.all_views.failed)
+        said = f"fail: {failed}" if failed else "give no result"
+        left_out = "the view" if count == 1 else f"the {count} views"
+        yield f"It passes only without {left_out} that a person excluded. All views together {said}."
 
 
 def install_line(

@@ -8,7 +8,7 @@ pictures and poses that a program holds.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,10 +19,13 @@ import msgspec
 import numpy as np
 
 from calibrate.arms.classes import ARM_CLASSES
+from calibrate.boards.detect import Detection
 from calibrate.boards.model import check_board, has_markers
-from calibrate.errors import BadViewsError, require_choice
+from calibrate.errors import BadViewsError, CalibrationError, require_choice
 from calibrate.files.calibration import Calibration
+from calibrate.files.versions import who
 from calibrate.handeye.blas_threads import one_blas_thread
+from calibrate.handeye.cell_fit import STAGES
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance, LensPrior
 from calibrate.handeye.solution import Profile, Solution, SolveOptions
@@ -33,8 +36,10 @@ from calibrate.pipeline.document import make_calibration
 from calibrate.pipeline.gates import GateLimits, judge
 from calibrate.pipeline.recorded_views import LoadedViews, Progress, load_views
 from calibrate.pipeline.solved import Solved
+from calibrate.results import AllViews, Excluded, Gate
 from calibrate.views.projection import intrinsics_names
 from calibrate.views.view_set import ViewSet
+from recordings.geometry import difference
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 
@@ -123,8 +128,11 @@ def prepare_views(
     options: JobOptions | None = None,
     progress: Progress | None = None,
     fewest: int = FEWEST_TO_SOLVE,
+    known: Mapping[int, Detection] | None = None,
 ) -> PreparedViews:
     """Open, find the boards, the lens where it is not known, and the board poses.
+
+    known: pose number → what was seen in its picture, where that was looked at before.
 
     Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
     """
@@ -135,7 +143,7 @@ def prepare_views(
         recorded = recording.info.camera
         camera = CameraModel(recorded.width, recorded.height)
     board = _board(options, recording.info.board)
-    loaded = load_views(recording, board, camera, progress, options.threads, fewest, options.without)
+    loaded = load_views(recording, board, camera, progress, options.threads, fewest, options.without, known)
     views, intrinsics = with_board_poses(loaded.views, loaded.board, options.lens_model)
     return PreparedViews(recording, loaded, views, intrinsics)
 
@@ -186,19 +194,67 @@ def solve_recording(
     options = options or JobOptions()
     begun_s = time.perf_counter()
     prepared = prepare_views(path, options, progress)
-    recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
-    solution = solve_views(views, solver_options(options, prepared))
-    of_station = recording.info.source != "imported"
-    gates = judge(solution, options.limits, _clock_bound_s(recording, solution), of_station)
+    solution, gates = _judged(prepared, options)
     calibration = make_calibration(
-        recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen
+        prepared.recording,
+        prepared.loaded,
+        prepared.views,
+        prepared.intrinsics,
+        solution,
+        gates,
+        options.chosen,
     )
+    if options.without:
+        excluded = Excluded(
+            views=sorted({number - 1 for number in options.without}),
+            who=who(),
+            all_views=_all_views(path, options, prepared, calibration, progress),
+        )
+        calibration = msgspec.structs.replace(calibration, excluded=excluded)
     return SolvedRecording(
         **vars(prepared),
         solution=solution,
         gates=gates,
         calibration=calibration,
         solve_ms=1e3 * (time.perf_counter() - begun_s),
+    )
+
+
+def _judged(prepared: PreparedViews, options: JobOptions) -> tuple[Solution, tuple[Gate, ...]]:
+    recording = prepared.recording
+    solution = solve_views(prepared.views, solver_options(options, prepared))
+    of_station = recording.info.source != "imported"
+    return solution, judge(solution, options.limits, _clock_bound_s(recording, solution), of_station)
+
+
+def _all_views(
+    path: Path,
+    options: JobOptions,
+    prepared: PreparedViews,
+    calibration: Calibration,
+    progress: Progress | None,
+) -> AllViews:
+    """Solve once more with the views that a person excluded, and say what that gives.
+
+    A person may exclude what cannot be solved at all: then the problem is what all views say.
+    """
+    STAGES.info("the same with all views, to compare")
+    with_all = replace(options, without=())
+    try:
+        everything = prepare_views(path, with_all, progress, known=prepared.loaded.detections)
+        solution, gates = _judged(everything, with_all)
+    except CalibrationError as problem:
+        return AllViews(problem=str(problem))
+    figures, evidence = solution.judgement.figures, solution.evidence
+    excluded = {number - 1 for number in options.without}
+    X, _ = solution.fit.installed
+    return AllViews(
+        error_mm=figures.predicted_error_mm,
+        holdout_m=None if figures.holdout is None else figures.holdout.e_t_m,
+        failed=[gate.name for gate in gates if not gate.passed],
+        shift=tuple(difference(calibration.transform.matrix, X).tolist()),
+        views=[view for view in evidence.residuals if view.index in excluded],
+        weights=[view for view in evidence.views.weights if view.index in excluded],
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -62,11 +62,13 @@ def load_views(
     threads: int | None = None,
     fewest: int = FEWEST_TO_SOLVE,
     without: tuple[int, ...] = (),
+    known: Mapping[int, Detection] | None = None,
 ) -> LoadedViews:
     """Find the board in every image of the recording.
 
     `board` and `camera` replace the recorded ones (another size, known intrinsics). `without`: numbers, from
-    1, of the poses that a person excludes; they are listed as rejected. The result does not depend on the
+    1, of the poses that a person excludes; they are listed as rejected. `known`: pose number → what was seen
+    before with the same board and camera, and is not looked for again. The result does not depend on the
     number of `threads`, as long as OpenCV itself uses one thread in each. Raises BadViewsError for pictures
     or poses that cannot be and a number that no pose has, TooFewViewsError when fewer than `fewest` show it.
     A picture that cannot be decoded costs its own pose only.
@@ -79,7 +81,7 @@ def load_views(
             views=max((view.index + 1 for view in recorded), default=0),
         )
     by_hand = [
-        RejectedView(view.index, view.name, "excluded (--without)", "by-hand")
+        RejectedView(view.index, view.name, "excluded by a person (--without)", "by-hand")
         for view in recorded
         if view.index + 1 in without
     ]
@@ -91,7 +93,7 @@ def load_views(
     views: list[BoardView] = []
     missing: list[RejectedView] = []
     seen: dict[int, Detection] = {}
-    for view, detection in detect_all(recording, recorded, spec, model, progress, threads):
+    for view, detection in _seen_in_order(recording, recorded, spec, model, progress, threads, known or {}):
         if isinstance(detection, BadImageError):
             missing.append(RejectedView(view.index, view.name, str(detection), "unreadable-picture"))
             continue
@@ -107,6 +109,25 @@ def load_views(
         model = msgspec.structs.replace(model, width=first.width, height=first.height)
     found = ViewSet(info.mount, tuple(views), model, told_model(recording), _calibrated_arm(recording))
     return LoadedViews(found, spec, (*missing, *by_hand), seen, recording.losses)
+
+
+def _seen_in_order(
+    recording: Recording,
+    views: list[View],
+    spec: BoardSpec,
+    camera: CameraModel,
+    progress: Progress | None,
+    threads: int | None,
+    known: Mapping[int, Detection],
+) -> Iterator[tuple[View, Detection | BadImageError]]:
+    """Yield what each view shows, in their order; only what is not known is looked for."""
+    new = [view for view in views if view.index not in known]
+    looked = detect_all(recording, new, spec, camera, progress, threads)
+    for view in views:
+        if view.index in known:
+            yield view, known[view.index]
+        else:
+            yield next(looked)
 
 
 def _told_views(

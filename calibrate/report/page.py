@@ -18,6 +18,7 @@ from calibrate.files.formatting import (
     arm_sentences,
     cell_sentences,
     error_shares,
+    exclusion_sentences,
     figures,
     noise_text,
     pose_text,
@@ -67,6 +68,7 @@ def _verdict(job: SolvedRecording) -> Iterator[str]:
         yield html.stamp(f"{stamp}. It is not installed on a real cell.")
     yield html.paragraph(rehearsal_text(job))
     yield html.verdict("good" if job.passed else "bad", use_text(calibration), verdict_text(calibration))
+    yield html.paragraph(" ".join(exclusion_sentences(calibration)))
 
 
 def _first_facts(job: SolvedRecording) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 import msgspec
@@ -82,10 +83,15 @@ def new_session_folder(root: Path, cell: str) -> Path:
     raise StationError("session-folder", folder=sessions, reason="it has too many of this second")
 
 
-def solve_arguments(recording: str, folder: str) -> tuple[str, ...]:
-    """Arguments of `calibrate`: result and report into the session's folder, where the screen finds them."""
+def solve_arguments(recording: str, folder: str, without: Collection[int] = ()) -> tuple[str, ...]:
+    """Arguments of `calibrate`: result and report into the session's folder, where the screen finds them.
+
+    without: pose numbers, from 0, of the views that a person excludes.
+    """
     output, report = (str(Path(folder) / name) for name in (CALIBRATION_FILE, REPORT_FILE))
-    return ("solve", recording, "-o", output, "--report", report)
+    excluded = ",".join(str(index + 1) for index in sorted(without))
+    left_out = ("--without", excluded) if excluded else ()
+    return ("solve", recording, "-o", output, "--report", report, *left_out)
 
 
 def require_writable(root: Path) -> None:

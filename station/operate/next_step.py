@@ -31,7 +31,8 @@ class NextStep:
 
 def after_solve(calibration: Calibration, objections: Sequence[str] = ()) -> NextStep:
     """Recommend a step after solving; `objections`: further points for which installing asks a reason."""
-    quality, rejected = calibration.quality, calibration.views.rejected
+    quality = calibration.quality
+    rejected = [view for view in calibration.views.rejected if view.kind != "by-hand"]
     if quality.failed:
         gate = quality.failed[0]
         if rejected and gate.name in ("weight", "views"):

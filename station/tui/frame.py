@@ -223,7 +223,7 @@ NEEDS: dict[str, Callable[[Known], object]] = {
     "solve_newest": lambda now: now.shown.session.recording and not now.result,
     "act('install')": lambda now: now.result and (now.result.state.withdrawn or not now.result.installed),
     **dict.fromkeys(("act('undo')", "app.drift_check"), lambda now: now.result and now.result.state.now),
-    **dict.fromkeys(("report", "act('touch test')"), lambda now: now.result),
+    **dict.fromkeys(("report", "act('touch test')", "views", "exclude"), lambda now: now.result),
     **dict.fromkeys(("pose('retake')", "pose('skip')"), lambda now: now.shown.session.poses),
     "retake_failed": lambda now: any(pose.state == "failed" for pose in now.shown.session.poses),
     **dict.fromkeys(("act('solve')", "act('check')"), lambda now: now.sessions),
@@ -231,7 +231,9 @@ NEEDS: dict[str, Callable[[Known], object]] = {
     "act('recover')": lambda now: not all(kept.session.sealed for kept in now.sessions or ()),
 }
 """What the action of a key works on; it has none while that is empty."""
-BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
+WIDE = 110
+"""Columns from which panels have a line around them."""
+BREAKPOINTS = [(0, "-narrow"), (WIDE, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
 """Style classes by the terminal's columns, and by its rows."""
 
 

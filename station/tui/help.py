@@ -47,6 +47,10 @@ TASKS: dict[str, tuple[tuple[str, str], ...]] = {
     "Judge the result, install it, undo it": (
         ("", "switch_mode('result')"),
         ("result", "report"),
+        ("result", "views"),
+        ("result", "exclude"),
+        ("result", "solve_without"),
+        ("result", "all_views"),
         ("result", "act('touch test')"),
         ("result", "act('install')"),
         ("result", "act('undo')"),

@@ -5,6 +5,7 @@ Long work runs in a process of its own, its lines shown, and can be cancelled.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 from calibrate.files.calibration import Calibration, Override
@@ -25,9 +26,9 @@ OVERRIDES = "Your name and the reason go into the file. Enter installs, Escape d
 NO_VERDICT = "Another session began: the drift check has no verdict. On 5, k judges the views it took."
 
 
-async def solve_session(link: DaemonLink, recording: str, folder: str) -> None:
-    """Solve, and show the result."""
-    what = solve_arguments(recording, folder)
+async def solve_session(link: DaemonLink, recording: str, folder: str, without: Collection[int] = ()) -> None:
+    """Solve, and show the result. without: pose numbers, from 0, of the views that a person excludes."""
+    what = solve_arguments(recording, folder, without)
     code = await link.ask_person(JobScreen(f"Solving {Path(folder).name}", "calibrate.cli", *what))
     if code in (0, 4):
         await link.app.show_result(Path(folder).name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -11,7 +11,7 @@ import numpy as np
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, VerticalScroll
+from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.widgets import DataTable, Static
 
@@ -19,7 +19,10 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.formatting import (
     accuracy_text,
     arm_sentences,
+    excluded_text,
+    exclusion_sentences,
     figures,
+    held_out_text,
     noise_text,
     pendant_texts,
     pose_text,
@@ -33,11 +36,13 @@ from calibrate.words import Word, word_of, words_in, words_of_gates
 from recordings.cli.console import open_in_browser
 from station.operate.next_step import StepKind, after_solve
 from station.protocol.results import Result
+from station.tui.frame import WIDE
 from station.tui.help import Explained
-from station.tui.jobs import install_result, undo_install
+from station.tui.jobs import install_result, solve_session, undo_install
 from station.tui.screen import Box, Rows, StationScreen
-from station.tui.task import Known
+from station.tui.task import Action, Known
 from station.tui.touch_corners import run_touch_test
+from station.tui.view_table import VIEW_COLUMNS, ViewRow, told_of, view_cells, view_rows
 from station.tui.words import (
     MARKS,
     VERDICTS,
@@ -51,7 +56,10 @@ from station.tui.words import (
     shortened,
 )
 
+NO_RECORDING = "The recording of this result is not on this station: solve it where it is."
 NO_RESULT = "No result yet: F9 solves what was captured. On 5, Enter shows older ones."
+CHECK_KEYS = "v: views  Enter explains"
+VIEW_KEYS = "v: checks  x: exclude  F9: solve  u: all views  Enter explains"
 BAR_CELLS, NAME_CELLS = 12, 27
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
 RESULT_GROUPS = ("Result", "Installed")
@@ -72,12 +80,15 @@ def verdict_lines(result: Result) -> Content:
     if result.verdict == "PASS WITH A REASON":
         said = accuracy_text(calibration)
     sign, _ = MARKS[VERDICTS[result.verdict]]
-    head = f"{sign} {result.verdict}, {became or new}"
+    verdict = f"{result.verdict}{excluded_text(calibration)}"
+    head = f"{sign} {verdict}, {became or new}"
     if result.withdrawn:
         sign, _ = MARKS["failed"]
-        head = f"{sign} WITHDRAWN: out of use, programs are refused it. It was {result.verdict}."
+        head = f"{sign} WITHDRAWN: out of use, programs are refused it. It was {verdict}."
         said = accuracy_text(calibration)
-    rows = [Content.styled(f"{head}\n{said}", "bold")]
+    held_out = held_out_text(calibration)
+    beside = f"\n{held_out}." if held_out else ""
+    rows = [Content.styled(f"{head}{beside}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID
         rows.append(Content.styled(sentence(validity_text(validity)), "bold $warn" if doubted else ""))
@@ -161,7 +172,7 @@ def _row(
 
 
 def evidence(result: Result, calibration: Calibration) -> Content:
-    """Write what installing changes, the camera's pose, and the views."""
+    """Write what excluding views and what installing changes, the camera's pose, and the views."""
     return Content("\n\n").join(
         lines(Content.styled(title, "bold $accent"), *rows)
         for title, rows in evidence_sections(result, calibration).items()
@@ -170,11 +181,19 @@ def evidence(result: Result, calibration: Calibration) -> Content:
 
 def evidence_sections(result: Result, calibration: Calibration) -> dict[str, list[Content]]:
     """Make the sections of the evidence, by their titles."""
+    without = exclusion_lines(calibration)
     return {
+        **({"Excluded views": without} if without else {}),
         "Change": change_lines(result, calibration),
         "Camera pose": pose_lines(calibration),
         "Views": view_lines(calibration),
     }
+
+
+def exclusion_lines(calibration: Calibration) -> list[Content]:
+    """Compare with the solve of all views, where a person excluded some; u goes back to it."""
+    told = [Content(words) for words in exclusion_sentences(calibration)]
+    return [*told, dim("u solves with all views again")] if told else []
 
 
 def change_lines(result: Result, calibration: Calibration) -> list[Content]:
@@ -229,25 +248,39 @@ class ResultScreen(StationScreen):
         Binding("b", "act('undo')", "Undo", tooltip="Back to the calibration before, or none"),
         Binding("h", "act('touch test')", "Touch", tooltip="Bring the tip onto corners of the board"),
         Binding("o", "report", "Report", tooltip="Open the report in a browser"),
+        # The borders of the two tables, and the one next action, name these: the last row has no room.
+        Binding("v", "views", "Views", show=False, tooltip="To the table of views, and back to the checks"),
+        Binding("x", "exclude", "Exclude", show=False, tooltip="Mark this view to be excluded, or not"),
+        Binding("f9", "solve_without", "Solve", show=False, tooltip="Solve again without the marked views"),
+        Binding("u", "all_views", "All views", show=False, tooltip="Solve again with all views"),
         Binding("d", "app.drift_check", "Check", tooltip="Capture a drift check of what is installed"),
     ]
 
     _drawn: object = ()
     """The result that was drawn last; a value that no result has before the first."""
+    _solve: object = ()
+    """Path and time of the solve whose views are marked."""
+    _views: Sequence[ViewRow] = ()
+    _wanted: frozenset[int] = frozenset()
+    """Pose numbers, from 0, of the views that the next solve excludes."""
 
     def body(self) -> ComposeResult:
         yield Static(NO_RESULT, id="verdict")
         with Horizontal(id="result"):
-            with Box("Checks", id="checks-box", below="Enter explains"):
-                yield Rows("check", "value", "", "limit", id="checks")
+            with Vertical(id="tables"):
+                with Box("Checks", id="checks-box", below=CHECK_KEYS):
+                    yield Rows("check", "value", "", "limit", id="checks")
+                with Box("Views", id="views-box", below=VIEW_KEYS):
+                    yield Rows(*VIEW_COLUMNS, id="views")
             with Evidence():
                 yield Static(id="evidence")
 
     def show(self, known: Known) -> None:
+        if known.result is not self._drawn:
+            self._draw(known.result)
         super().show(known)
-        result = known.result
-        if result is self._drawn:
-            return
+
+    def _draw(self, result: Result | None) -> None:
         self._drawn = result
         verdict = self.query_one("#verdict", Static)
         doubted = result is not None and result.installed and result.state.doubted
@@ -260,11 +293,60 @@ class ResultScreen(StationScreen):
         self.query_one("#result").display = calibration is not None
         if result is not None and calibration is not None:
             self._rows = check_rows(result, calibration)
-            self.table.show([cells for cells, _, _ in self._rows])
+            self.query_one("#checks", Rows).show([cells for cells, _, _ in self._rows])
+            self._show_views(result.path, calibration)
             self.query_one("#evidence", Static).update(evidence(result, calibration))
 
+    def on_resize(self) -> None:
+        """Name the tables' keys beside their titles where they have no lower border."""
+        narrow = self.size.width < WIDE
+        for box, title, keys in (("#checks-box", "Checks", CHECK_KEYS), ("#views-box", "Views", VIEW_KEYS)):
+            self.query_one(box).border_title = f"{title}  {keys}" if narrow else title
+
+    def _show_views(self, path: str, calibration: Calibration) -> None:
+        """Draw the table of views; marks are kept while it is the same solve."""
+        solve = (path, calibration.created)
+        if solve != self._solve:
+            self._solve = solve
+            self._views = view_rows(calibration)
+            self._wanted = frozenset(calibration.excluded_views)
+            self.query_one("#views", Rows).move_cursor(row=0)
+        self._draw_views(calibration)
+
+    def _draw_views(self, calibration: Calibration) -> None:
+        self.query_one("#views", Rows).show([view_cells(row, self._wanted) for row in self._views])
+        self.NEXT = self._next_solve(calibration)
+        self.refresh_bindings()
+
+    def _next_solve(self, calibration: Calibration) -> Action | None:
+        """The one next action while marks differ from what was solved."""
+        if not self._is_marked(calibration):
+            return None
+        poses = ", ".join(str(index + 1) for index in sorted(self._wanted))
+        what = f"Without pose {poses}." if poses else "With all views."
+        return Action("F9", "Solve again", f"{what} x takes a mark back.")
+
+    def _is_marked(self, calibration: Calibration) -> bool:
+        return self._wanted != frozenset(calibration.excluded_views)
+
+    def does_something(self, action: str) -> bool:
+        result = self.known.result
+        calibration = None if result is None else result.calibration
+        if action == "all_views":
+            return calibration is not None and bool(self._wanted or calibration.excluded_views)
+        if action != "solve_without":
+            return super().does_something(action)
+        if calibration is None:
+            return super().does_something("solve_newest")
+        return self._is_marked(calibration)
+
     def on_data_table_row_selected(self, event: DataTable.RowSelected) -> None:
-        """Explain a check at Enter."""
+        """Explain a check or a view at Enter."""
+        if event.data_table.id == "views":
+            row = self._views[event.cursor_row]
+            told = told_of(row)
+            self.app.push_screen(Explained(f"Pose {row.index + 1}", told, words_in(told)))
+            return
         _, text, word = self._rows[event.cursor_row]
         self.app.push_screen(Explained(word.title, text, [word]))
 
@@ -275,6 +357,62 @@ class ResultScreen(StationScreen):
             told = f"{verdict_lines(result)}\n{evidence(result, result.calibration)}"
             used = sorted(words_in(told), key=lambda word: word.group not in RESULT_GROUPS)
             self.app.push_screen(Explained("The words of this result", "", used))
+
+    def action_views(self) -> None:
+        """Go to the table of views, or back; where there is no room for both, one takes the other's place."""
+        at_views = self._at_views()
+        self.query_one("#result").set_class(not at_views, "-views")
+        self.query_one("#checks" if at_views else "#views", Rows).focus()
+
+    def _at_views(self) -> bool:
+        return self.focused is self.query_one("#views", Rows)
+
+    def action_exclude(self) -> None:
+        """Mark the view at the cursor, or take its mark back; nothing is solved before F9."""
+        result = self.known.result
+        if result is None or result.calibration is None:
+            self.notify(NO_RESULT)
+            return
+        if not self._at_views():
+            self.action_views()
+            return
+        row = self._views[self.query_one("#views", Rows).cursor_row]
+        if not row.can_be_used:
+            self.notify(f"Pose {row.index + 1} takes no part: {row.reason}", markup=False)
+            return
+        self._wanted ^= {row.index}
+        self._draw_views(result.calibration)
+        self.show(self.known)
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def action_solve_without(self) -> None:
+        """Solve the shown session again, without the marked views."""
+        if self.known.result is None or self.known.result.calibration is None:
+            await self.app.run_action("solve_newest", self.app)
+            return
+        await self._solve_again(self.known.result, self._wanted)
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def action_all_views(self) -> None:
+        """Undo what was excluded, and every mark."""
+        result = self.known.result
+        calibration = None if result is None else result.calibration
+        if result is None or calibration is None:
+            self.notify(NO_RESULT)
+            return
+        self._wanted = frozenset()
+        self._draw_views(calibration)
+        self.show(self.known)
+        if calibration.excluded_views:
+            await self._solve_again(result, frozenset())
+
+    async def _solve_again(self, result: Result, without: frozenset[int]) -> None:
+        kept = (kept.session for kept in self.known.sessions or () if result.session)
+        session = next((session for session in kept if session.name == result.session), None)
+        if session is None or not session.recording:
+            self.notify(NO_RECORDING)
+            return
+        await solve_session(self.link, session.recording, session.folder, without)
 
     def action_report(self) -> None:
         result = self.known.result

@@ -371,4 +371,8 @@ def _with_result(result: Result, status: StationStatus) -> Action:
         return Action("i", "Install", f"PASS: {step.text}.{touch}", at="result")
     if step.kind is StepKind.RETAKE:
         return Action("n", "Plan and retake", step.text, at="plan", look=True)
+    if step.text in result.objections:
+        return Action(
+            "", "See what speaks against it", f"{step.text} i asks for a reason.", at="result", look=True
+        )
     return Action("", "See what failed", f"Look for: {step.text}", at="result", look=True)

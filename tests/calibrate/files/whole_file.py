@@ -16,7 +16,7 @@ from calibrate.arms.chain import LearnedArm
 from calibrate.files.calibration import Calibration, Override
 from calibrate.files.touch import Touch
 from calibrate.handeye.arm_table import CorrectedArm, FramePose, HeldOutViews
-from calibrate.results import Posterior
+from calibrate.results import AllViews, Excluded, Posterior, ViewQuality, ViewWeight
 
 EYE = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
 TRIPLE = (0.1, 0.2, 0.3)
@@ -55,6 +55,19 @@ def whole(calibration: Calibration) -> Calibration:
         override=Override("It must run.", "somebody", ["views"]),
         verification=[Touch(0, (0.0, 0.0), (0.1, 0.1), (0.2, 0.2), "told by a person", "one", "2026")],
         posterior=msgspec.structs.replace(learned, without_joints=learned),
+        excluded=Excluded(
+            views=[2],
+            who="somebody",
+            all_views=AllViews(
+                problem="none",
+                error_mm=0.1,
+                holdout_m=0.001,
+                failed=["views"],
+                shift=(0.0,) * 6,
+                views=[ViewQuality(2, 0.1, 0.2, 0.3)],
+                weights=[ViewWeight(2, 1.0)],
+            ),
+        ),
         arm_table=CorrectedArm(
             offered=True,
             model="any",

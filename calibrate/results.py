@@ -210,7 +210,9 @@ class CrossValidation:
     rms_mm: float
     rms_deg: float
     claimed_mm: float
-    """Value of `rms_mm` that the stated uncertainties predict."""
+    """Value of `rms_mm` that the stated uncertainties predict: those of a placed point (`PointError`), as far
+    as left-out views show them. An error of the arm that all views share is not in it, the noise of the
+    boards' poses is."""
     folds: int
     limit: float = 0.0
     """Limit of `rms_mm` over `claimed_mm`; above it the stated uncertainties are too small."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -413,19 +414,37 @@ def install_line(
     return _line(root, camera, *words, *(["--override", override] if override else []))
 
 
-def _regression(calibration: Calibration, before: Calibration | None) -> list[Gate]:
-    """Make a failed gate where the predicted error is much larger than that of the calibration replaced.
+def _error_of_X_m(calibration: Calibration, distance_m: float) -> float:
+    """Predict the error, metres, of a point so far from the camera by X alone."""
+    return point_error_m(calibration.transform.matrix, np.array(calibration.covariance), distance_m)
 
-    Empty where that one failed its own gates.
+
+def _placed_error_m(calibration: Calibration, distance_m: float) -> float:
+    """Predict the error, metres, of a placed point at another distance than that for which it is stated.
+
+    X's part grows with the distance; the rest, the arm's, stays.
+    """
+    point = calibration.quality.point
+    assert point is not None
+    stated = (1e-3 * point.error_mm) ** 2
+    rest = max(stated - _error_of_X_m(calibration, point.at_m) ** 2, 0.0)
+    return math.sqrt(rest + _error_of_X_m(calibration, distance_m) ** 2)
+
+
+def _regression(calibration: Calibration, before: Calibration | None) -> list[Gate]:
+    """Make a failed gate where a point is placed much worse than by the calibration that is replaced.
+
+    Where one of them does not state that, the errors of X alone are compared. Empty where the replaced one
+    failed its own gates.
     """
     if before is None or before.quality.failed:
         return []
     distance_m = calibration.quality.working_distance_m or 0.0
-    ours, theirs = (
-        point_error_m(one.transform.matrix, np.array(one.covariance), distance_m)
-        for one in (calibration, before)
-    )
-    title = f"Regression: error of X at {1e3 * distance_m:.0f} mm"
+    both_placed = calibration.quality.point is not None and before.quality.point is not None
+    error_m = _placed_error_m if both_placed else _error_of_X_m
+    ours, theirs = error_m(calibration, distance_m), error_m(before, distance_m)
+    what = "placed-point error" if both_placed else "error of X"
+    title = f"Regression: {what} at {1e3 * distance_m:.0f} mm"
     remedy = "Capture more or better poses, or keep the installed one."
     if len({one.provenance.software.get("calibration-station") for one in (calibration, before)}) > 1:
         remedy += " Its error was stated by another version: solve its recording again to compare."

@@ -230,8 +230,14 @@ def _killed(place: int, new: Path, root: Path) -> bool:
 def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(
     make_file, solved_real: SolvedRecording, tmp_path: Path
 ) -> None:
+    quality = solved_real.calibration.quality
+
     def vaguer(times: float) -> dict[str, Any]:
-        return {"covariance": (np.array(solved_real.calibration.covariance) * times**2).tolist()}
+        point = msgspec.structs.replace(quality.point, error_mm=times * quality.point.error_mm)
+        return {
+            "covariance": (np.array(solved_real.calibration.covariance) * times**2).tolist(),
+            "quality": msgspec.structs.replace(quality, point=point),
+        }
 
     root = tmp_path / "s"
     install(make_file(**vaguer(2.0)), root)  # nothing to compare with
@@ -243,6 +249,24 @@ def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(
     made = install(make_file(**vaguer(2.0)), root, override="the old lens is broken")
     assert "no_worse" in made.calibration.override.overridden[0]
     assert rollback(root).number == 3
+
+
+def test_an_x_known_less_well_is_no_worse_where_the_arm_makes_most_of_the_error(
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:
+    """A point is placed as well as before. Beside a file that does not state that, X alone is compared."""
+    quality = solved_real.calibration.quality
+    covariance = np.array(solved_real.calibration.covariance)
+    root = tmp_path / "s"
+    point = msgspec.structs.replace(quality.point, error_mm=100 * quality.point.error_mm)
+    by_arm = msgspec.structs.replace(quality, point=point)
+    install(make_file(quality=by_arm), root)
+    vaguer = (covariance * 2.0**2).tolist()
+    install(make_file(quality=by_arm, covariance=vaguer), root)
+    earlier = msgspec.structs.replace(quality, point=None)
+    install(make_file(quality=earlier), root)
+    with raises("gate-failed", GateFailedError, gates=1, objections=0):
+        install(make_file(quality=by_arm, covariance=vaguer), root)
 
 
 # --- reasons, and what is told before ---

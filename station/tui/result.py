@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 from textual import work
 from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
+from textual.binding import ActiveBinding, Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.widgets import DataTable, Static
@@ -248,10 +249,10 @@ class ResultScreen(StationScreen):
         Binding("b", "act('undo')", "Undo", tooltip="Back to the calibration before, or none"),
         Binding("h", "act('touch test')", "Touch", tooltip="Bring the tip onto corners of the board"),
         Binding("o", "report", "Report", tooltip="Open the report in a browser"),
-        # The borders of the two tables, and the one next action, name these: the last row has no room.
+        # The tables and the one next action name these: the last row has no room.
         Binding("v", "views", "Views", show=False, tooltip="To the table of views, and back to the checks"),
         Binding("x", "exclude", "Exclude", show=False, tooltip="Mark this view to be excluded, or not"),
-        Binding("f9", "solve_without", "Solve", show=False, tooltip="Solve again without the marked views"),
+        Binding("f9", "solve_without", "Solve", tooltip="Solve again without the marked views"),
         Binding("u", "all_views", "All views", show=False, tooltip="Solve again with all views"),
         Binding("d", "app.drift_check", "Check", tooltip="Capture a drift check of what is installed"),
     ]
@@ -328,6 +329,19 @@ class ResultScreen(StationScreen):
 
     def _is_marked(self, calibration: Calibration) -> bool:
         return self._wanted != frozenset(calibration.excluded_views)
+
+    @property
+    def active_bindings(self) -> dict[str, ActiveBinding]:
+        """All keys; F9 stands in the last row while nothing is solved, later the one next action names it."""
+        keys = super().active_bindings
+        solves = keys.get("f9")
+        if solves is not None and self._is_solved:
+            keys["f9"] = solves._replace(binding=replace(solves.binding, show=False))
+        return keys
+
+    @property
+    def _is_solved(self) -> bool:
+        return self.known.result is not None and self.known.result.calibration is not None
 
     def does_something(self, action: str) -> bool:
         result = self.known.result

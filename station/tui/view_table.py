@@ -13,7 +13,7 @@ from calibrate.results import ViewQuality
 from station.tui.words import UNKNOWN, Mark, dim, mark, shortened
 
 VIEW_COLUMNS = ("pose", "corners", "flange", "", "weight", "view")
-REASON_CELLS = 34
+REASON_CELLS = 20
 NOTHING_TO_EXCLUDE = ("corners", "unreadable-picture")
 """Kinds of views that no solve can use."""
 

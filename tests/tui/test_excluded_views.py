@@ -24,7 +24,7 @@ from tests.tui.test_install import GOOD
 
 USED = [ViewQuality(0, 0.1, 0.1, 0.01), ViewQuality(1, 0.1, 0.9, 0.01), ViewQuality(2, 0.2, 0.1, 0.01)]
 REJECTED = [
-    RejectedView(3, "p4", "the robot's pose is wrong", "wrong-pose"),
+    RejectedView(3, "p4", "it contradicts others", "wrong-pose"),
     RejectedView(4, "p5", "excluded by a person (--without)", "by-hand"),
     RejectedView(5, "p6", "no board", "corners"),
 ]
@@ -60,7 +60,7 @@ def test_excluded_views_come_first_then_rejected_ones_then_the_worst() -> None:
 def test_a_row_tells_residuals_weight_and_reason() -> None:
     told = {row.index: " ".join(cell.plain for cell in view_cells(row, {4})) for row in view_rows(small())}
     assert "0.900 mm" in told[1] and "0.010°" in told[1] and "100 %" in told[1] and "used" in told[1]
-    assert "the robot's pose is wrong" in told[3] and "  0 %" in told[3]
+    assert "it contradicts" in told[3] and "  0 %" in told[3]
     assert "excluded by anna" in told[4] and "3.000 px" in told[4] and "30 %" in told[4]
 
 

@@ -56,6 +56,7 @@ from tests.tui.conftest import (
 from tests.tui.snapshots import FOLDER, SIZES, compare
 from tests.tui.test_by_hand import by_hand
 from tests.tui.test_capture import seeing
+from tests.tui.test_excluded_views import small
 from tests.tui.test_install import GOOD, OFF
 
 NOON_NS = 1_790_000_000_000_000_000
@@ -282,6 +283,7 @@ SHOTS: dict[str, Shot] = {
     "result-touched": after(Result("/s/1/c.yaml", msgspec.structs.replace(PASSED, verification=[OFF]))),
     "result-installed": after(Result("/s/1/c.yaml", PASSED, Installed(PASSED, drift=(CHECKED,)))),
     "result-withdrawn": after(Result("/s/1/c.yaml", PASSED, Installed(PASSED, validity=TAKEN_OUT))),
+    "result-excluded": after(Result("/s/1/c.yaml", small()), keys=("v", "down", "down", "down", "x")),
     "result-unreadable": after(Result("/s/1/c.yaml", problem="calibration.yaml: damaged, or edited by hand")),
     "sessions-none": Shot(fresh(), "sessions"),
     "sessions": after(GOOD_RESULT, "sessions"),

@@ -21,6 +21,7 @@ from calibrate.cli.follow import Followed
 from calibrate.cli.importing import ImportJson
 from calibrate.files.calibration import Calibration
 from calibrate.files.validity import Validity
+from recordings.cli.commands import ExportJson
 from recordings.errors import ErrorReport
 from recordings.info import RecordingInfo
 from recordings.recover import Recovery
@@ -29,7 +30,7 @@ from station.cell.pose_plan import Plan
 from station.cell.status import StationStatus
 from station.cli.demo import DemoJson
 from station.cli.plan import PlanJson
-from station.cli.requests import DoctorJson
+from station.cli.requests import DoctorJson, PoseJson, QuitJson, StateJson, StopJson
 from station.cli.session import SessionJson
 
 FOLDER = Path(__file__).resolve().parent / "schemas"
@@ -44,12 +45,17 @@ TYPES: dict[str, tuple[str, Any]] = {
     "install": ("calibrate install --json, calibrate rollback --json", InstalledJson),
     "validity": ("calibrate withdraw --json; `validity` of other commands", Validity),
     "follow": ("A line of calibrate follow", Followed),
-    "drift-check": ("calibrate drift-check --json", DriftCheckJson),
+    "drift-check": ("calibrate drift-check --json, station drift-check --json", DriftCheckJson),
     "status": ("station status --json", StationStatus),
     "doctor": ("station doctor --json", DoctorJson),
+    "stop": ("station stop --json", StopJson),
+    "state": ("station acknowledge | pause | finish --json", StateJson),
+    "pose": ("station retake | skip --json", PoseJson),
+    "quit": ("station quit --json", QuitJson),
     "demo": ("station demo --json", DemoJson),
     "plan-report": ("station plan --json", PlanJson),
     "capture": ("station capture | resume --json", SessionJson),
+    "export": ("recordings export --json", ExportJson),
     "info": ("recordings info --json", RecordingInfo),
     "recover": ("recordings recover --json", list[Recovery]),
     "import": ("recordings import --json", ImportJson),

@@ -22,6 +22,7 @@ from station.devices.cell import Cell
 from station.devices.serial_trigger import SerialTrigger
 from station.server.connections import ClientServer
 from station.server.dispatch import SessionDispatcher
+from station.server.quitting import way_of_service
 from station.server.stop_server import StopServer
 from station.session.session import Session
 
@@ -53,9 +54,10 @@ class Daemon:
         told_to_end: Callable[[], None] = lambda: None,
         real_time: RealTimeThreads | None = None,
     ) -> None:
-        """`told_to_end` is called when SIGTERM, SIGINT or `end` begins the shutdown."""
+        """`told_to_end` is called when SIGTERM, SIGINT, `end` or the verb `quit` begins the shutdown."""
         self.session = Session(cell, root)
-        dispatcher = SessionDispatcher(self.session)
+        service = way_of_service(os.getpid(), os.environ.get("NOTIFY_SOCKET", ""))
+        dispatcher = SessionDispatcher(self.session, end=self.end, service=service)
         self._client_server = ClientServer(control, dispatcher)
         self._stop_server = StopServer(control, dispatcher)
         self.session.supervisor.before_round = self._stop_server.round

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 import typer
 
 from recordings.cli.console import AsJson, plain_console, print_json
@@ -37,6 +38,16 @@ def info_command(recording: Rec, as_json: AsJson = False) -> None:
         raise typer.Exit(3)
 
 
+class ExportJson(msgspec.Struct, frozen=True):
+    """`recordings export --json`"""
+
+    written: str
+    """Path of the folder or bag."""
+    images: int
+    left_out: int
+    """Images without a pose that counts."""
+
+
 def export_command(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="What to write; it must not exist.")],
@@ -44,6 +55,7 @@ def export_command(
         Target,
         typer.Option("--to", help="folder: images and poses, for `import`; ros2: a bag."),
     ],
+    as_json: AsJson = False,
 ) -> None:
     """Write images and poses, or a ROS 2 bag."""
     from recordings.exporters.export import export_recording
@@ -52,6 +64,9 @@ def export_command(
     written = export_recording(opened, output, to)
     views = len(opened.views())
     others = sum(len(segment.image_sequences()) for segment in opened.segments) - views
+    if as_json:
+        print_json(ExportJson(str(written), views, others))
+        return
     left_out = f"; {others} without a pose that counts left out" if others else ""
     print(plain_text(f"{written} written: {views} images{left_out}"))
 

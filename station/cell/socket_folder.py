@@ -164,11 +164,15 @@ def peer_of(link: socket.socket) -> tuple[int, int, int]:
     return pid, uid, gid
 
 
-def way_to_end(link: socket.socket) -> str:
+def way_to_end(link: socket.socket, path: Path) -> str:
     """Say how this user ends the daemon at the other end of a Unix socket; empty: it is another's."""
+    import shlex  # rarely needed
+
     pid, uid, _ = peer_of(link)
-    own = pid and uid == os.getuid()
-    return f": `kill {pid}`, which stops the arm first and finishes the recording" if own else ""
+    if not pid or uid != os.getuid():
+        return ""
+    where = "" if path == default_socket() else f" --socket {shlex.quote(str(path))}"
+    return f": `station quit{where}`"
 
 
 def user_name(uid: int) -> str:

@@ -54,7 +54,9 @@ STATION = LazyGroup(
             rare=True,
         ),
         "stop": LazyCommand(
-            "station.cli.requests:stop_command", "Stop the arm now (STOP).", ("station stop",)
+            "station.cli.requests:stop_command",
+            "Stop the arm now (STOP).",
+            ("station stop", "station stop --json"),
         ),
         "acknowledge": LazyCommand(
             "station.cli.requests:acknowledge_command",
@@ -90,6 +92,12 @@ STATION = LazyGroup(
             "station.cli.requests:skip_command",
             "Leave a pose out, in later runs of the plan too.",
             ("station skip 7",),
+            rare=True,
+        ),
+        "quit": LazyCommand(
+            "station.cli.requests:quit_command",
+            "End the station that you started by hand, such as by `station`.",
+            ("station quit",),
             rare=True,
         ),
         "drift-check": LazyCommand(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import select
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from socket import AF_UNIX
 from socket import socket as connection
@@ -15,7 +17,7 @@ from socket import socket as connection
 from recordings.files import state_root
 from station.cell.child import ChildProcess, start_child
 from station.cell.errors import StationError
-from station.cell.socket_folder import default_socket, way_to_end
+from station.cell.socket_folder import default_socket, peer_of, way_to_end
 from station.cli.console import Socket, require_terminal
 from station.protocol.client import DaemonGoneError, ask
 from station.protocol.verbs import GetPlan
@@ -81,8 +83,54 @@ def tell_what_goes_on(socket: Path) -> None:
     """Tell a person who closed the screen that the daemon goes on, and how to end it."""
     with connection(AF_UNIX) as link:
         if link.connect_ex(str(socket)) == 0:
-            end = f" End it{how}." if (how := way_to_end(link)) else ""
+            end = f" End it{how}." if (how := way_to_end(link, socket)) else ""
             print(f"The station goes on without this screen. `station` opens it again.{end}")
+
+
+class DaemonProcess:
+    """Process of the daemon at the other end of a socket, to be waited for."""
+
+    def __init__(self, link: connection, pid: int, process: int | None) -> None:
+        self.pid = pid
+        self._link, self._process = link, process
+        """Connection to it; descriptor of the process, None: it is not seen from here, as in a container."""
+
+    def ended(self, wait_s: float) -> bool:
+        """Wait until it has ended, or at least closed its socket; False where it has not in this time."""
+        if self._process is not None:
+            return bool(select.select([self._process], [], [], max(wait_s, 0.0))[0])
+        give_up_s = time.monotonic() + wait_s
+        while (left_s := give_up_s - time.monotonic()) > 0:
+            self._link.settimeout(left_s)
+            try:
+                if not self._link.recv(4096):
+                    return True
+            except TimeoutError:
+                break
+            except OSError:
+                return True
+        return False
+
+
+@contextmanager
+def daemon_process(socket: Path) -> Iterator[DaemonProcess]:
+    """Find the process that serves a socket, before it is asked to end. DaemonGoneError where none does."""
+    with connection(AF_UNIX) as link:
+        try:
+            link.connect(str(socket))
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise DaemonGoneError(path=socket) from None
+        except PermissionError:
+            raise DaemonGoneError("not-allowed", path=socket) from None
+        pid = peer_of(link)[0]
+        process = None
+        with suppress(OSError):
+            process = os.pidfd_open(pid)
+        try:
+            yield DaemonProcess(link, pid, process)
+        finally:
+            if process is not None:
+                os.close(process)
 
 
 def answers(socket: Path) -> bool:

@@ -46,7 +46,9 @@ def post_command(
     the numbers on the pendant: type them when the arm stands; for 3 s it counts as standing there. Labels and
     commas between the numbers do no harm.
 
-    Exit codes: 0 the input ended; 1 the station refused the poses, or is gone.
+    A line that the station refuses is told with its number, and the others go on.
+
+    Exit codes: 0 the input ended; 3 some lines were refused; 1 the station refused the program, or is gone.
     """
     path = post_socket(socket or default_socket())
     if typed:
@@ -59,27 +61,45 @@ def post_command(
             link.connect(str(path))
         except OSError as error:
             raise RobotError("post-no-station", socket=path, reason=error.strerror) from None
+        answers = Answers(numbered=not typed)
         for line in _typed_lines(typed, source) if typed else sys.stdin.buffer:
             try:
                 link.sendall(line)
-                refused = select.select([link], [], [], 0)[0] and link.recv(4096)
+                if select.select([link], [], [], 0)[0]:
+                    answers.tell(link.recv(4096))
             except OSError:
-                refused = b""
                 with suppress(OSError):
-                    refused = link.recv(4096)
-                if not refused:
-                    raise RobotError("post-no-station", socket=path, reason="it ended") from None
-            _exit_if(refused or b"")
+                    answers.tell(link.recv(4096))  # why it refused the program
+                raise RobotError("post-no-station", socket=path, reason="it ended") from None
         link.shutdown(SHUT_WR)
         link.settimeout(ENDED_S)
         with suppress(OSError):
-            _exit_if(link.recv(4096))  # nothing, once all lines are read
+            while heard := link.recv(4096):  # nothing more, once all lines are read
+                answers.tell(heard)
+    raise typer.Exit(3 if answers.refused else 0)
 
 
-def _exit_if(refused: bytes) -> None:
-    if refused:
-        err.print(json.loads(refused)["text"], style="red")
-        raise typer.Exit(1)
+class Answers:
+    """What the station says of the lines."""
+
+    def __init__(self, numbered: bool) -> None:
+        """`numbered`: a person knows the lines by their numbers."""
+        self._numbered = numbered
+        self.refused = 0
+        """Number of lines that it refused."""
+        self._rest = b""
+
+    def tell(self, heard: bytes) -> None:
+        """Print each answer. Ends the command where the station refuses the program."""
+        *lines, self._rest = (self._rest + heard).split(b"\n")
+        for line in lines:
+            answer = json.loads(line)
+            number = answer.get("line")
+            place = f"line {number}: " if number and self._numbered else ""
+            err.print(f"{place}{answer['text']}", style="red")
+            if number is None:
+                raise typer.Exit(1)
+            self.refused += 1
 
 
 def _typed_lines(name: str, source: str) -> Iterator[bytes]:

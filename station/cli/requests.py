@@ -1,23 +1,26 @@
-"""Commands that ask the daemon one thing: state, STOP, pause, finish, retake, skip, doctor."""
+"""Commands that ask the daemon one thing: state, STOP, pause, finish, retake, skip, quit, doctor."""
 
 from __future__ import annotations
 
 import asyncio
 import shlex
+import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import typer
 from rich.text import Text
 
+from station.cell.errors import StationError
 from station.cell.socket_folder import default_socket
-from station.cell.status import StationStatus
+from station.cell.status import PoseState, PoseStatus, StationState, StationStatus
 from station.cli.console import AsJson, Socket, out, print_json
+from station.cli.daemon import daemon_process
 from station.operate.motion import status_now
 from station.protocol.client import ask
 from station.protocol.stop_client import stop_and_tell
-from station.protocol.verbs import Acknowledge, Check, Doctor, Finish, Pause, Retake, Skip, Verb
+from station.protocol.verbs import Acknowledge, Check, Doctor, Finish, Pause, Quit, Retake, Skip, Verb
 
 PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
 _MARKS = {
@@ -70,7 +73,15 @@ def _print_state(status: StationStatus) -> None:
     out.print(Text.assemble((status.state.value, "bold"), f"{mark}  {status.reason}"))
 
 
-def stop_command(socket: Socket = None) -> None:
+class StopJson(msgspec.Struct, frozen=True):
+    """`station stop --json`"""
+
+    outcome: Literal["rests", "moves", "unknown", "silent", "no-daemon", "denied", "untrusted"]
+    """rests: confirmed, and the arm rests. With any other press the emergency stop."""
+    text: str
+
+
+def stop_command(socket: Socket = None, as_json: AsJson = False) -> None:
     """Stop the arm now (STOP).
 
     The emergency stop on the pendant is the safety device. Anyone may stop, at any time. Latched: next look
@@ -78,10 +89,32 @@ def stop_command(socket: Socket = None) -> None:
 
     Exit codes: 0 the station confirmed it and the arm rests; 1 not confirmed: press the emergency stop.
     """
-    raise typer.Exit(stop_and_tell(socket or default_socket()))
+    raise typer.Exit(stop_and_tell(socket or default_socket(), as_json))
 
 
-def acknowledge_command(socket: Socket = None) -> None:
+class StateJson(msgspec.Struct, frozen=True):
+    """`station acknowledge --json`, `station pause --json`, `station finish --json`"""
+
+    state: StationState
+    """State after the request; a pose that is under way is taken first."""
+    reason: str
+    cause: str
+    """Code of `reason`, for programs."""
+    pending: str
+    """What waits for the end of the pose under way; empty: nothing."""
+    recording: str
+    """Path of the recording that was finished last; empty: none."""
+
+
+def _tell_state(status: StationStatus, as_json: bool) -> None:
+    if as_json:
+        pending, recording = status.pending, status.finished.recording
+        print_json(StateJson(status.state, status.reason, status.cause, pending, recording))
+    else:
+        _print_state(status)
+
+
+def acknowledge_command(socket: Socket = None, as_json: AsJson = False) -> None:
     """Leave `stopped` or `fault` after looking at the cell. Nothing moves.
 
     For a real arm it needs a person at a terminal: by ssh use `ssh -t HOST station acknowledge`. Until then
@@ -89,40 +122,54 @@ def acknowledge_command(socket: Socket = None) -> None:
 
     Next: `station resume` continues the session, `station finish` finishes it.
     """
-    _print_state(_after(Acknowledge(), socket))
+    _tell_state(_after(Acknowledge(), socket), as_json)
 
 
-def pause_command(socket: Socket = None) -> None:
+def pause_command(socket: Socket = None, as_json: AsJson = False) -> None:
     """Pause after the pose under way.
 
     Anyone may. Next: `station resume` or `finish`.
     """
     ask(socket or default_socket(), Pause())
-    out.print("Pauses after this pose. Next: `station resume` or `finish`")
+    if as_json:
+        _tell_state(status_of(socket), as_json)
+    else:
+        out.print("Pauses after this pose. Next: `station resume` or `finish`")
 
 
-def finish_command(socket: Socket = None) -> None:
+def finish_command(socket: Socket = None, as_json: AsJson = False) -> None:
     """Finish the recording with the poses captured so far.
 
     A pose under way is captured first. Next: `calibrate solve RECORDING`; `station status` names it.
     """
     status = _after(Finish(), socket)
-    _print_state(status)
-    if status.finished.recording:
+    _tell_state(status, as_json)
+    if status.finished.recording and not as_json:
         out.print(f"recording {status.finished.recording}")
 
 
-def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
+class PoseJson(msgspec.Struct, frozen=True):
+    """`station retake --json`, `station skip --json`"""
+
+    pose: int
+    """Number of the pose, from 1."""
+    state: PoseState
+    kept: bool
+    """To be captured again: the present image counts until it is replaced."""
+    reason: str
+
+
+def retake_command(pose: PoseNumber, socket: Socket = None, as_json: AsJson = False) -> None:
     """Mark a pose to be captured again by the next run."""
-    _print_pose(_after(Retake(pose - 1), socket), pose, "Next: `station resume`")
+    _tell_pose(_after(Retake(pose - 1), socket), pose, "Next: `station resume`", as_json)
 
 
-def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
+def skip_command(pose: PoseNumber, socket: Socket = None, as_json: AsJson = False) -> None:
     """Leave a pose out, in later runs of the plan too.
 
     `station retake` brings it back. A pose that has a view keeps it: only its retake is left out.
     """
-    _print_pose(_after(Skip(pose - 1), socket), pose, f"`station retake {pose}` plans it")
+    _tell_pose(_after(Skip(pose - 1), socket), pose, f"`station retake {pose}` plans it", as_json)
 
 
 def _after(request: Verb[Any], socket: Path | None) -> StationStatus:
@@ -131,9 +178,47 @@ def _after(request: Verb[Any], socket: Path | None) -> StationStatus:
     return status_of(socket)
 
 
-def _print_pose(status: StationStatus, pose: int, then: str) -> None:
-    reason = next((p.reason for p in status.session.poses if p.index == pose - 1), "")
-    out.print(f"pose {pose}: {reason}. {then}")
+def _tell_pose(status: StationStatus, number: int, then: str, as_json: bool) -> None:
+    poses = (pose for pose in status.session.poses if pose.index == number - 1)
+    # In capture by hand a skipped view is gone.
+    pose = next(poses, PoseStatus(number - 1, "", state="skipped"))
+    if as_json:
+        print_json(PoseJson(number, pose.state, pose.kept, pose.reason))
+    else:
+        out.print(f"pose {number}: {pose.reason}. {then}")
+
+
+QUIT_S = 8.0
+"""Longest wait for the daemon's process to end, which takes 5 s where a disk or a driver hangs."""
+
+
+class QuitJson(msgspec.Struct, frozen=True):
+    """`station quit --json`"""
+
+    pid: int
+    """The process that ended."""
+    took_s: float
+
+
+def quit_command(socket: Socket = None, as_json: AsJson = False) -> None:
+    """End the station that you started by hand, such as by `station`.
+
+    Refused while a session is not finished, the arm moves, STOP or a fault is not acknowledged, or another
+    client has control: it says what to do first. A service ends by `systemctl stop station`.
+
+    Exit codes: 0 it has ended; 1 refused, or it has not ended within 8 s.
+    """
+    path = socket or default_socket()
+    began_s = time.monotonic()
+    with daemon_process(path) as daemon:
+        ask(path, Quit())
+        if not daemon.ended(QUIT_S - (time.monotonic() - began_s)):
+            raise StationError("quit-too-late", pid=daemon.pid, waited_s=QUIT_S)
+    took_s = time.monotonic() - began_s
+    if as_json:
+        print_json(QuitJson(daemon.pid, round(took_s, 2)))
+    else:
+        out.print(f"The station has ended, after {took_s:.1f} s. `station` starts it again.")
 
 
 class DoctorJson(msgspec.Struct, frozen=True):

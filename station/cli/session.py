@@ -277,18 +277,20 @@ def drift_check_command(
     headless: Headless = False,
     approve: Approve = "",
     socket: Socket = None,
+    as_json: AsJson = False,
 ) -> None:
     """Check by a few new poses that the calibration holds.
 
     The board may lie elsewhere by now. Eight poses detect a shift of 0.5 mm or 0.1° on a usual cell, five on
     a quiet one; where they do not, it says how many more would. Ctrl-C stops the arm. With nobody there it
-    needs `--plan FILE --headless --approve HASH`, as `station capture` does.
+    needs `--plan FILE --headless --approve HASH`, as `station capture` does. --json prints what
+    `calibrate drift-check --json` does.
 
     Exit codes: 0 PASS, 4 FAIL, 1 no recording or nothing installed, 2 usage.
     """
 
     async def captured() -> StationStatus:
-        async with attended(socket, headless, approve, quiet=headless) as shell:
+        async with attended(socket, headless, approve, quiet=headless or as_json) as shell:
             standing = await shell.status()
             if standing.robot.by_hand:  # a person who moves it needs the picture
                 identity = standing.robot.identity
@@ -303,8 +305,8 @@ def drift_check_command(
     outcome = asyncio.run(captured())
     check = outcome.checked
     if not check.recording:
-        _not_finished(outcome)
-    what = check_arguments(check.recording, check.folder)
+        raise RefusedError("check-not-finished", state=outcome.state.value, reason=outcome.reason)
+    what = (*check_arguments(check.recording, check.folder), *(["--json"] if as_json else []))
     done = subprocess.run([sys.executable, "-m", "calibrate.cli", *what])
     raise typer.Exit(done.returncode)
 

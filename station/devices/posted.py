@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -45,6 +46,8 @@ READ_BYTES, PAUSE_S, LINES_READ = 8192, 0.005, 50
 """So much is read at once, then for `PAUSE_S` nothing; of what came together only the newest `LINES_READ`
 lines are parsed."""
 LINE_BYTES = 2048
+ANSWERS_PER_S = 20
+"""Most wrong lines of which a program is told within a second; while it reads none of that, none."""
 STATES_KEPT = 20_000
 """Most states kept, however many poses with times within `HISTORY_S` are posted."""
 PROGRAMS = 8
@@ -66,6 +69,20 @@ ARRIVAL_S = 0.1
 """Longest delay assumed of posts without a time of their own, when their speed is judged."""
 CLOCK_STEP_S = 1.0
 """Smallest step of a program's clock ahead of this computer's that counts as another unit of time."""
+
+
+class Refused(NamedTuple):
+    """A line that a program posted, and what is wrong with it."""
+
+    line: int
+    """Its number, from 1: the declaration."""
+    code: str
+    text: str
+    """Not the error itself, which would keep alive all lines that came with this one."""
+
+    @classmethod
+    def of(cls, line: int, error: StaleStateError) -> Refused:
+        return cls(line, error.code, str(error))
 
 
 class PostedArm:
@@ -216,7 +233,7 @@ class PostedArm:
             if self._poster:
                 raise RobotError("post-refused", poster=poster, reason=f"{self._poster} has the arm")
             self._poster, holds = poster, True
-            await self._take(reader)
+            await self._take(reader, writer)
         except (StationError, OSError) as error:
             if link.family is socket.AF_UNIX or holds or not self._poster:
                 self._notify(str(error))
@@ -245,7 +262,7 @@ class PostedArm:
             raise RobotError("post-token", file=self.token_file)
         self._strangers.pop(writer, None)
 
-    async def _take(self, reader: asyncio.StreamReader) -> None:
+    async def _take(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Take a program's lines until it ends. RobotError where it is none for this cell."""
         lines, wanted, model = _lines(reader), SOURCES[self._source], self.identity.model
         try:
@@ -260,27 +277,40 @@ class PostedArm:
             reason = f"it posts the arm {declared.robot}, the cell's is {model}"
             raise RobotError("post-refused", poster=self._poster, reason=reason)
         self._delay_s, self._clock = declared.late_s, None
-        self._posts(others)
+        answers = _Answers(writer)
+        answers.tell(self._posts(others, 2))  # 1 is the declaration
+        number = 2 + len(others)
         async for some in lines:
-            self._posts(some)
+            answers.tell(self._posts(some, number))
+            number += len(some)
 
-    def _posts(self, lines: list[bytes]) -> None:
+    def _posts(self, lines: list[bytes], first: int) -> list[Refused]:
+        """Take the posts of a piece, of which the first line has this number; return what was wrong."""
         arrived_ns = time.monotonic_ns()
+        refused = list[Refused]()
         if len(lines) > LINES_READ:
             self._notify(f"{self._poster} posts too fast: only the newest poses are read")
-        found = list[tuple[Post, Vector6]]()
-        for line in filter(bytes.strip, lines[-LINES_READ:]):
+        found = list[tuple[int, Post, Vector6]]()
+        left_out = max(len(lines) - LINES_READ, 0)
+        for number, line in enumerate(lines[left_out:], first + left_out):
+            if not line.strip():
+                continue
             try:
-                found.append(read_post(line, self._written))
+                found.append((number, *read_post(line, self._written)))
             except StaleStateError as error:
                 self._note_wrong(error)
-        for post, pose in found if found and found[-1][0].t is not None else found[-1:]:
-            self._add(post, pose, arrived_ns)
+                refused.append(Refused.of(number, error))
+        for number, post, pose in found if found and found[-1][1].t is not None else found[-1:]:
+            if (wrong := self._add(post, pose, arrived_ns)) is not None:
+                self._note_wrong(wrong)
+                refused.append(Refused.of(number, wrong))
+        return refused
 
     def _note_wrong(self, error: StaleStateError) -> None:
         self._wrong, self._wrong_since_s = StaleStateError.from_data(error.data), time.monotonic()
 
-    def _add(self, post: Post, pose: Vector6, arrived_ns: int) -> None:
+    def _add(self, post: Post, pose: Vector6, arrived_ns: int) -> StaleStateError | None:
+        """Add a pose to the states; return what is wrong with it beside those before it."""
         before = self._states[-1] if self._states else None
         if (post.t is None) is not (self._clock is None):
             self._forget()
@@ -291,7 +321,7 @@ class PostedArm:
             step_s = posted_s - before.stamps.controller_s
             waited_s = (arrived_ns - before.stamps.host_monotonic_ns) / 1e9
             if step_s == 0:
-                return  # posted again: no news
+                return None  # posted again: no news
             if step_s > waited_s + CLOCK_STEP_S:
                 wrong = StaleStateError("post-clock", step_s=step_s, passed_s=waited_s)
             if step_s < 0 or wrong is not None:
@@ -313,8 +343,7 @@ class PostedArm:
         for callback in self._callbacks:
             callback(self._states[-1])
         self._first_pose.set()
-        if wrong is not None:
-            self._note_wrong(wrong)
+        return wrong
 
     def _forget(self) -> None:
         """Forget what belongs to another clock."""
@@ -326,6 +355,29 @@ class PostedArm:
         if notice != self.notice:
             log.warning("%s", notice)
         self.notice, self._notice_since_s = notice, time.monotonic()
+
+
+class _Answers:
+    """Tells a program which of its lines are wrong, and waits for nothing."""
+
+    def __init__(self, writer: asyncio.StreamWriter) -> None:
+        self._writer = writer
+        self._second_began_s = 0.0
+        self._told = 0
+        """Number of lines told within this second."""
+
+    def tell(self, refused: list[Refused]) -> None:
+        """Tell of some lines, as far as the program reads and `ANSWERS_PER_S` permits."""
+        now_s = time.monotonic()
+        if now_s - self._second_began_s >= 1.0:
+            self._second_began_s = now_s
+            self._told = 0
+        link = self._writer.transport
+        for one in refused[: ANSWERS_PER_S - self._told]:
+            if link.is_closing() or link.get_write_buffer_size() > 0:
+                return
+            self._writer.write(msgspec.json.encode(one._asdict()) + b"\n")
+            self._told += 1
 
 
 async def _gives(token: bytes, reader: asyncio.StreamReader) -> bool:

@@ -154,20 +154,27 @@ class Outcome(Enum):
 
 def main(arguments: Sequence[str]) -> int | None:
     """Run `station stop`; return the exit code, 0 only when the arm rests. None: not for this program."""
-    match list(arguments):
+    others = [word for word in arguments if word != "--json"]
+    match others:
         case []:
             control = default_socket()
         case ["--socket", path] if not path.startswith("-"):
             control = Path(path)
         case _:
             return None
-    return stop_and_tell(control)
+    return stop_and_tell(control, as_json=len(others) < len(arguments))
 
 
-def stop_and_tell(control: Path) -> int:
+def stop_and_tell(control: Path, as_json: bool = False) -> int:
+    """Send STOP and say what became of it; return the exit code, 0 only when the arm rests."""
     outcome, reason = stop(control)
     good = outcome is Outcome.RESTS
     words = outcome.told(control, reason)
+    if as_json:
+        import json  # only now that STOP was sent
+
+        print(json.dumps({"outcome": outcome.name.lower().replace("_", "-"), "text": words}))
+        return 0 if good else 1
     print(words if good else f"station: {words}", file=sys.stdout if good else sys.stderr)
     return 0 if good else 1
 

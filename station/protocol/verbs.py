@@ -431,4 +431,11 @@ class NoteTouches(Verb[TouchesNoted], frozen=True):
     """Each as `verification` in a calibration file."""
 
 
+class Quit(Verb[Done], frozen=True):
+    """End a daemon that its user started by hand, once its session is finished and nothing is latched."""
+
+    states = RESTING | {S.DISCONNECTED}
+    spoken = "ending the station"
+
+
 VERBS: dict[str, type[Verb[object]]] = {kind.verb(): kind for kind in Verb.__subclasses__()}

@@ -306,4 +306,4 @@ def _remove_stale(path: Path) -> None:
             return
         except OSError as error:
             raise StationError("socket", path=path, reason=str(error)) from None
-        raise StationError("already-served", path=path, how=way_to_end(probe))
+        raise StationError("already-served", path=path, how=way_to_end(probe, path))

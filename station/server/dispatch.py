@@ -15,6 +15,7 @@ from station.protocol import verbs
 from station.protocol.stop_client import ArmMotion
 from station.protocol.verbs import VERBS, Verb
 from station.server.approval import Approval, ApprovalRule, Peer, Process, process
+from station.server.quitting import require_nothing_left, require_started_by
 from station.session.checklist import checklist
 from station.session.session import Session
 from station.session.threads import NAMES
@@ -23,8 +24,16 @@ from station.session.threads import NAMES
 class SessionDispatcher:
     """The session as the connections of `server.connections` reach it."""
 
-    def __init__(self, session: Session, see: Callable[[int], Process | None] = process) -> None:
+    def __init__(
+        self,
+        session: Session,
+        see: Callable[[int], Process | None] = process,
+        end: Callable[[], None] = lambda: None,
+        service: str = "",
+    ) -> None:
+        """`end`: begins the daemon's end. `service`: `way_of_service`, empty where a person started it."""
         self._session = session
+        self._end, self._service = end, service
         cell = session.context.cell
         self._rule = ApprovalRule(cell.config.approval, cell.source == "simulated", see)
         self._leaving: set[asyncio.Task[object]] = set()
@@ -100,6 +109,8 @@ class SessionDispatcher:
         except msgspec.DecodeError as error:
             raise RefusedError("wrong-arguments", verb=verb, problem=str(error)) from None
         self._rule.meet(caller)
+        if kind is verbs.Quit:
+            require_started_by(caller, self._service)
         self._session.admit(kind, caller.client_id, caller.who)
         result = await self._carry_out(caller, request)
         return verbs.Done() if result is None else result
@@ -149,6 +160,10 @@ class SessionDispatcher:
                 return await session.previews.observe(verb.tag)
             case verbs.Doctor():
                 return await checklist(context, session.devices.troubles)
+            case verbs.Quit():
+                require_nothing_left(session, self.motion)
+                context.store.event("quit", f"ended by {caller.who}", who=caller.who)
+                self._end()
             case verbs.GetResult():
                 return await session.results.result(verb.session)
             case verbs.GetSessions():

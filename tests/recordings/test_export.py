@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from recordings.cli import main
+from recordings.cli.commands import ExportJson
 from recordings.exporters.export import export_recording
 from recordings.geometry import base_from_flange
 from recordings.images import encode_png
@@ -109,6 +110,9 @@ def test_images_of_no_pose_that_counts_stay_out_of_a_bag_and_their_number_is_tol
     assert re.findall(r"\d+", done.stdout.removeprefix(str(tmp_path))) == ["1", "2"]
     bag = open_bag(tmp_path / "out")
     assert [topic.messages for topic in bag.topics.values() if topic.kind is Kind.IMAGE] == [1]
+    done = call(main, "export", tmp_path / "a.mcap", "--to", "folder", "-o", tmp_path / "folder", "--json")
+    told = msgspec.json.decode(done.stdout, type=ExportJson)
+    assert told == ExportJson(str(tmp_path / "folder"), 1, 2)
 
 
 def test_a_bag_tells_flange_and_images_as_they_were_recorded(tmp_path: Path) -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import pytest
@@ -23,6 +22,7 @@ from station.cell.status import MotionPreview, PoseStatus, SessionStatus, Statio
 from station.cli import daemon, main, session
 from station.cli.app import STATION
 from station.cli.daemon import ensure_daemon, own_daemon, tell_what_goes_on
+from station.cli.requests import PoseJson, QuitJson, StateJson, StopJson
 from station.protocol.client import DaemonGoneError
 from station.protocol.states import RUNNING
 from tests.codes import raises
@@ -31,6 +31,8 @@ from tests.patience import PATIENCE_S, wait_until
 from tests.tui.conftest import FakeLink, idle, in_session
 
 pytestmark = pytest.mark.process
+
+T = TypeVar("T")
 
 
 class Shell:
@@ -52,6 +54,12 @@ class Shell:
         with pytest.raises(CodedError) as problem:
             STATION([*args, "--socket", str(self.socket)], prog_name="station")
         return problem.value.code
+
+    def told(self, command: str, kind: type[T], *args: str) -> T:
+        """What a command prints with --json, nothing else on standard output."""
+        code, out, err = self.ask(command, *args, "--json")
+        assert code == 0, err
+        return msgspec.json.decode(out, type=kind)
 
     def state(self) -> dict[str, Any]:
         state: dict[str, Any] = json.loads(self.ask("status", "--json")[1])
@@ -85,15 +93,23 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
     code, out, _ = shell.ask("doctor", "--json")
     assert code == 0 and json.loads(out)["ok"]
     assert shell.refused("pause") == "wrong-state"
-    assert shell.ask("stop")[0] == 0
+    assert shell.told("stop", StopJson).outcome == "rests"
     assert shell.state()["state"] == "stopped"
-    assert shell.ask("acknowledge")[0] == 0 and shell.state()["state"] == "idle"
+    assert shell.refused("quit") == "wrong-state"
+    assert shell.told("acknowledge", StateJson).state == shell.state()["state"] == "idle"
     assert shell.ask("retake", "9")[0] == 1
-    assert shell.ask("retake", "2")[0] == 0 and shell.state()["session"]["poses"][1]["kept"]
-    assert shell.ask("skip", "2")[0] == 0 and "kept" not in shell.state()["session"]["poses"][1]
+    kept = shell.told("retake", PoseJson, "2")
+    assert (kept.pose, kept.kept, kept.state) == (2, True, "planned")
+    assert shell.state()["session"]["poses"][1]["kept"]
+    skipped = shell.told("skip", PoseJson, "2")
+    assert (skipped.pose, skipped.kept) == (2, False) and skipped.reason
+    assert "kept" not in shell.state()["session"]["poses"][1]
 
     for key in (signal.SIGINT, signal.SIGTSTP):
         is_stop(shell, plan, key)
+
+    assert shell.told("quit", QuitJson).pid > 0
+    assert shell.refused("status") == shell.refused("quit") == "no-daemon"
 
 
 def is_stop(shell: Shell, plan: Path, key: signal.Signals) -> None:
@@ -241,4 +257,4 @@ def test_closing_the_screen_tells_what_goes_on(tmp_path: Path, capsys: pytest.Ca
         served.bind(str(path))
         served.listen()
         tell_what_goes_on(path)
-    assert f"`kill {os.getpid()}`" in capsys.readouterr().out
+    assert f"`station quit --socket {path}`" in capsys.readouterr().out

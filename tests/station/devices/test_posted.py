@@ -214,6 +214,27 @@ async def test_a_wrong_post_costs_no_right_one_that_came_with_it(arm: PostedArm)
     assert trouble(arm) == "post-unreadable"
 
 
+async def test_a_program_is_told_which_of_its_lines_are_wrong_and_goes_on(arm: PostedArm) -> None:
+    poster = await Poster.at(arm)
+    poster.post()
+    poster.say(b"nonsense\n")
+    poster.post()
+    poster.say({"base_from_flange": [400.0, -200.0, 300.0, *POSE[3:]], "t": poster.t + 0.01})
+    poster.post([0.4, -0.2, 0.9, *POSE[3:]])
+    async with asyncio.timeout(PATIENCE_S):
+        told = [json.loads(await poster.reader.readline()) for _ in range(3)]
+    assert sorted((one["line"], one["code"]) for one in told) == [
+        (3, "post-unreadable"),
+        (5, "post-too-far"),
+        (6, "post-jump"),
+    ]
+    assert all(one["text"] for one in told)
+    states: list[RobotState] = []
+    arm.subscribe(states.append)
+    poster.post([0.4, -0.2, 0.9, *POSE[3:]])
+    await until(lambda: states and states[-1].tcp_pose[2] == 0.9)
+
+
 async def test_a_program_that_falls_silent_or_is_killed_is_named(arm: PostedArm) -> None:
     poster = await Poster.at(arm)
     await poster.rest(5)
@@ -402,6 +423,22 @@ async def test_a_refused_program_is_told_so_although_it_has_nothing_more_to_say(
     if not typed:
         await posting.communicate(b'{"source": "live", "robot": "another arm"}\n')
     assert await posting.wait() == 1
+
+
+async def test_a_piped_line_that_is_refused_is_told_with_its_number(arm: PostedArm) -> None:
+    words = ["post", "--socket", str(arm.path.with_suffix(".sock"))]
+    posting = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "station.cli",
+        *words,
+        stdin=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    right = json.dumps({"base_from_flange": POSE, "t": 1.0}).encode()
+    _, said = await posting.communicate(b'{"source": "live"}\n' + right + b"\nnonsense\n")
+    assert posting.returncode == 3
+    assert b"line 3: " in said
 
 
 def test_a_matrix_is_read_as_rows_and_as_its_numbers_row_by_row() -> None:

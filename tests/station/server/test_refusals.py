@@ -21,7 +21,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "acknowledge": {}, "load_plan": {}, "make_plan": {}, "prepare": {}, "go": {"token": "t"},
     "pause": {}, "finish": {}, "retake": {"index": 0}, "skip": {"index": 1},
     "free_drive": {"on": True}, "record": {},
-    "install": {"session": "s-1"}, "rollback": {"seen": 1},
+    "quit": {}, "install": {"session": "s-1"}, "rollback": {"seen": 1},
     "note_touches": {"session": "s-1", "touches": []},
     "observe": {"tag": {"kind": "april-tag", "square_m": 0.05}},
 }  # fmt: skip

@@ -8,7 +8,7 @@ PYTHON ?= $(or $(SYSTEM_PYTHON),python3)
 VENV_FLAGS := $(if $(SYSTEM_PYTHON),--system-site-packages,)
 READY := $(VENV)/.ready
 
-.PHONY: help venv demo demo-gige test foreign check bench pages docs snapshots soak install install-files uninstall clean
+.PHONY: help venv demo demo-gige test foreign check bench pages docs snapshots soak install install-files install-shell uninstall clean
 help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
@@ -91,10 +91,26 @@ install: install-files  ## install programs, units and users' definitions below 
 	sed -i '1s|^#!$(DESTDIR)$(APP)|#!$(APP)|' $(addprefix $(DESTDIR)$(APP)/bin/,station calibrate recordings)
 	install -d $(DESTDIR)$(PREFIX)/bin
 	for name in station calibrate recordings; do ln -sf $(APP)/bin/$$name $(DESTDIR)$(PREFIX)/bin/$$name; done
-	install -d $(DESTDIR)$(PREFIX)/share/man/man1
-	for name in station calibrate recordings; do \
-		$(DESTDIR)$(APP)/bin/python docs/man.py $$name > $(DESTDIR)$(PREFIX)/share/man/man1/$$name.1; done
+	$(MAKE) install-shell
 	@echo "Next: docs/integrator/service.md (users, configuration, start)."
+
+# Of what is installed, so that it needs no other Python.
+SHELL_PYTHON ?= $(DESTDIR)$(APP)/bin/python
+SHARE := $(DESTDIR)$(PREFIX)/share
+MAN := $(SHARE)/man/man1
+BASH_COMPLETIONS := $(SHARE)/bash-completion/completions
+ZSH_COMPLETIONS := $(SHARE)/zsh/site-functions
+FISH_COMPLETIONS := $(SHARE)/fish/vendor_completions.d
+
+install-shell:  # manual pages and completions, told by the programs themselves
+	install -d $(MAN) $(BASH_COMPLETIONS) $(ZSH_COMPLETIONS) $(FISH_COMPLETIONS)
+	set -e; for name in station calibrate recordings; do \
+		asks=_$${name^^}_COMPLETE; \
+		$(SHELL_PYTHON) docs/man.py $$name > $(MAN)/$$name.1; \
+		env $$asks=source_bash $(SHELL_PYTHON) -m $$name.cli > $(BASH_COMPLETIONS)/$$name; \
+		env $$asks=source_fish $(SHELL_PYTHON) -m $$name.cli > $(FISH_COMPLETIONS)/$$name.fish; \
+		env $$asks=source_zsh $(SHELL_PYTHON) -m $$name.cli | \
+			sed '/^$$/d; s/^compdef .*/_'$$name'_completion/' > $(ZSH_COMPLETIONS)/_$$name; done
 
 install-files:  # the part of install that needs no network
 	for unit in $(UNITS); do \
@@ -106,6 +122,7 @@ install-files:  # the part of install that needs no network
 	install -D -m 644 systemd/60-station.rules $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules
 	test -e $(DESTDIR)$(SYSCONFDIR)/station/station.env || \
 		install -D -m 644 systemd/station.env $(DESTDIR)$(SYSCONFDIR)/station/station.env
+	install -D -m 644 station/example.yaml $(DESTDIR)$(SYSCONFDIR)/station/station.example.yaml
 	for folder in . operator integrator contributor reference decisions; do \
 		install -d $(DESTDIR)$(DOC)/$$folder && install -m 644 docs/$$folder/*.md $(DESTDIR)$(DOC)/$$folder; done
 	for files in schemas/*.json examples/*.* pictures/*.png pictures/*.svg; do \
@@ -116,7 +133,11 @@ uninstall:  ## stop the services and remove what install put there; configuratio
 	$(if $(DESTDIR),,-systemctl stop 'calibrate@*' 2>/dev/null)
 	rm -rf $(DESTDIR)$(APP) $(DESTDIR)$(DOC)
 	rm -f $(addprefix $(DESTDIR)$(PREFIX)/bin/,station calibrate recordings)
-	rm -f $(addsuffix .1,$(addprefix $(DESTDIR)$(PREFIX)/share/man/man1/,station calibrate recordings))
+	rm -f $(addsuffix .1,$(addprefix $(MAN)/,station calibrate recordings))
+	rm -f $(addprefix $(BASH_COMPLETIONS)/,station calibrate recordings)
+	rm -f $(addprefix $(ZSH_COMPLETIONS)/_,station calibrate recordings)
+	rm -f $(addsuffix .fish,$(addprefix $(FISH_COMPLETIONS)/,station calibrate recordings))
+	rm -f $(DESTDIR)$(SYSCONFDIR)/station/station.example.yaml
 	rm -f $(addprefix $(DESTDIR)$(SYSCONFDIR)/systemd/system/,$(UNITS))
 	rm -f $(DESTDIR)$(SYSCONFDIR)/sysusers.d/station.conf $(DESTDIR)$(SYSCONFDIR)/tmpfiles.d/station.conf
 	rm -f $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules

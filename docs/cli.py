@@ -27,26 +27,48 @@ def page() -> str:
 
 def _program(program: str, group: LazyGroup) -> list[str]:
     lines = ["", f"## {program}", "", inspect.cleandoc(group.help or "").partition("\n")[0]]
+    for title, told in (("file", group.files), ("environment variable", group.environment)):
+        lines += [
+            "",
+            f"| {title} | |",
+            "|-|-|",
+            *(f"| `{name}` | {_cell(what)} |" for name, what in told.items()),
+        ]
     for name in group.commands:
         command = group.resolve_command(typer.Context(group), [name])[1]
         lines += ["", f"### {program} {name}", "", inspect.cleandoc(command.help or "")]
-        shown = [o for o in command.params if not getattr(o, "hidden", False) and o.name != "help"]
         rows = [
-            f"| `{', '.join((*o.opts, *o.secondary_opts))}` | {_cell(getattr(o, 'help', ''))} | {_given(o)} |"
-            for o in shown
+            f"| `{', '.join((*o.opts, *o.secondary_opts))}` | {_cell(getattr(o, 'help', ''))} | {_code(o)} |"
+            for o in options(command)
         ]
         if rows:
             lines += ["", "| option | | default |", "|-|-|-|", *rows]
-        examples = re.findall(r"^- `(.+)`$", command.epilog or "", re.MULTILINE)
-        lines += ["", "```", *examples, "```"] if examples else []
+        told = examples(command)
+        lines += ["", "```", *told, "```"] if told else []
     return lines
 
 
-def _given(option: Any) -> str:
+def options(command: Any) -> list[Any]:
+    """List the options and arguments of a command, without what all have."""
+    return [one for one in command.params if not getattr(one, "hidden", False) and one.name != "help"]
+
+
+def examples(command: Any) -> list[str]:
+    """List command lines that the help of a command ends with."""
+    return re.findall(r"^- `(.+)`$", command.epilog or "", re.MULTILINE)
+
+
+def default(option: Any) -> str:
+    """Write the default of an option; empty where it has none, or is off."""
     if isinstance(option.show_default, str):
-        return f"`{option.show_default}`"
+        return option.show_default
     plain = isinstance(option.default, (str, int, float)) and not isinstance(option.default, bool)
-    return f"`{option.default}`" if plain and str(option.default) else ""
+    return str(option.default) if plain else ""
+
+
+def _code(option: Any) -> str:
+    given = default(option)
+    return f"`{given}`" if given else ""
 
 
 def _cell(text: str | None) -> str:

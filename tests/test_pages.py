@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from importlib import import_module
@@ -79,6 +80,31 @@ def test_a_manual_page_names_every_command(program: str) -> None:
     asked = call(import_module(f"{program}.cli").main, "--all")
     commands = re.findall(r"^\.SS \w+ ([\w-]+)$", page, re.MULTILINE)
     assert len(commands) > 3 and all(command in asked.stdout for command in commands)
+
+
+@pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
+def test_a_manual_page_has_examples_defaults_and_files(program: str) -> None:
+    """As the help of each command and the table of files say them."""
+    page = runpy.run_path(str(ROOT / "docs" / "man.py"))["page"](program)
+    plain = page.replace("\\-", "-").replace("\\e", "\\")
+    group = getattr(import_module(f"{program}.cli.app"), program.upper())
+    for name in group.commands:
+        part = plain.partition(f".SS {program} {name}\n")[2].partition("\n.SS ")[0]
+        assert f"{program}" in part.partition("Examples:")[2], name
+    assert "Default: " in plain
+    assert len(group.files) > 2
+    for name, what in (group.files | group.environment).items():
+        assert f".B {name}\n{what.replace('`', '')}" in plain
+
+
+@pytest.mark.skipif(not shutil.which("groff"), reason="no groff here")
+@pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
+def test_a_manual_page_is_right_for_roff(program: str) -> None:
+    page = runpy.run_path(str(ROOT / "docs" / "man.py"))["page"](program)
+    done = subprocess.run(
+        ["groff", "-K", "utf8", "-man", "-ww", "-z"], input=page, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_users_meet_at_most_42_commands() -> None:

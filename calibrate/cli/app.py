@@ -96,4 +96,17 @@ CALIBRATE = LazyGroup(
     COMMANDS,
     help="From a recording to a calibration that can be trusted, installed and undone.",
     epilog="Exit codes: 0 good, 1 failed, 2 usage, 3 done with loss, 4 gate failed.",
+    files={
+        "ROOT/calibrations/current": "The installed calibration, which programs read. ROOT is `--root`, else "
+        "$STATE_DIRECTORY, else ~/.local/state/calibration-station; /var/lib/station of the service.",
+        "ROOT/calibrations/gen/": "Every calibration that was ever installed; they never change.",
+        "ROOT/calibrations/validity.jsonl": "Who installed, undid or withdrew what, when and why.",
+        "ROOT/calibrations/checks.jsonl": "Every drift check.",
+        "ROOT/calibrations/cameras/NAME/": "The same for every camera that is not named main.",
+    },
+    environment={
+        "STATE_DIRECTORY": "State folder, as systemd tells it; `--root` names another.",
+        "XDG_STATE_HOME": "In place of ~/.local/state.",
+        "NO_COLOR": "No colours.",
+    },
 )

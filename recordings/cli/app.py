@@ -29,4 +29,10 @@ RECORDINGS = LazyGroup(
     },
     help="Look into, make, convert and rescue recordings.",
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage, 3 done with loss.",
+    files={
+        "SESSION/session.mcap": "A recording; session-2.mcap and so on where the session was interrupted.",
+        "SESSION/session.mcap.part": "One that was never finished: `recordings recover` rebuilds it.",
+        "FOLDER/dataset.yaml, FOLDER/poses.csv": "Pictures and poses, to be imported, or as exported.",
+    },
+    environment={"NO_COLOR": "No colours."},
 )

@@ -60,7 +60,16 @@ class LazyCommand(NamedTuple):
 class LazyGroup(TyperGroup):
     """A command line of `LazyCommand`s."""
 
-    def __init__(self, commands: Mapping[str, LazyCommand], help: str, epilog: str) -> None:
+    def __init__(
+        self,
+        commands: Mapping[str, LazyCommand],
+        help: str,
+        epilog: str,
+        files: Mapping[str, str],
+        environment: Mapping[str, str],
+    ) -> None:
+        """`files`, `environment`: what the manual page and docs/reference/cli.md say of each, by its name."""
+        self.files, self.environment = files, environment
         super().__init__(
             commands={name: TyperCommand(name, help=command.line) for name, command in commands.items()},
             help=help,

@@ -127,4 +127,26 @@ STATION = LazyGroup(
     },
     help="A calibration station for a robot cell. Alone: the operator's screen.",
     epilog="Exit codes: 0 good, 1 failed, 2 usage, 3 done with loss, 4 gate failed.",
+    files={
+        "~/.config/calibration-station/station.yaml": "Your cell, which `station` serves.",
+        "/etc/station/station.yaml": "The computer's cell: that of the service, and of `station` where you "
+        "have none of your own.",
+        "/etc/station/station.example.yaml": "A configuration to start from, as `station doctor --example` "
+        "prints it.",
+        "/etc/station/station.env": "The service's environment.",
+        "~/.local/state/calibration-station/": "State folder: sessions, installed calibrations, and "
+        "daemon.log of a daemon that `station` started.",
+        "/var/lib/station/": "State folder of the service.",
+        "$XDG_RUNTIME_DIR/station-control.sock": "Control socket of a daemon that you started.",
+        "/run/station/control.sock": "Control socket of the service. Where it exists it is the default.",
+    },
+    environment={
+        "STATION_CONFIG": "Configuration to serve, in place of yours and of the computer's.",
+        "STATE_DIRECTORY": "State folder, as systemd tells it; `--root` names another.",
+        "RUNTIME_DIRECTORY": "Folder of the sockets, as systemd tells it; `--socket` names another.",
+        "XDG_CONFIG_HOME, XDG_STATE_HOME, XDG_RUNTIME_DIR": "In place of ~/.config, of ~/.local/state, and "
+        "folder of the sockets.",
+        "TEXTUAL_THEME": "Theme of the screen: station-dark, station-light, terminal.",
+        "NO_COLOR": "No colours; every state has a sign or a word all the same.",
+    },
 )

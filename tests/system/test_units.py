@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -17,9 +18,8 @@ needs_systemd = pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="
 
 
 def make(target: str, root: Path) -> None:
-    subprocess.run(
-        ["make", "-C", str(ROOT), target, f"DESTDIR={root}"], check=True, capture_output=True, text=True
-    )
+    words = [f"DESTDIR={root}", f"SHELL_PYTHON={sys.executable}"]
+    subprocess.run(["make", "-C", str(ROOT), target, *words], check=True, capture_output=True, text=True)
 
 
 @pytest.fixture
@@ -164,3 +164,43 @@ def test_a_session_is_solved_in_its_own_folder(scratch: Path) -> None:
     command = next(line for line in text.splitlines() if line.startswith("ExecStart="))
     assert "%I" not in command
     assert "--output /var/lib/station/sessions/%i/calibration.yaml" in command
+
+
+def test_an_example_of_a_configuration_is_laid_down_and_is_no_cell_yet(tmp_path: Path) -> None:
+    make("install-files", tmp_path)
+    folder = tmp_path / "etc/station"
+    assert (folder / "station.example.yaml").read_bytes() == (ROOT / "station/example.yaml").read_bytes()
+    assert not (folder / "station.yaml").exists(), "a program would serve it"
+
+
+def test_manual_pages_and_completions_are_laid_down_and_taken_away(tmp_path: Path) -> None:
+    make("install-files", tmp_path)
+    make("install-shell", tmp_path)
+    share = tmp_path / "usr/local/share"
+    for name in ("station", "calibrate", "recordings"):
+        assert f".TH {name.upper()} 1" in (share / f"man/man1/{name}.1").read_text()
+        zsh = (share / f"zsh/site-functions/_{name}").read_text()
+        assert zsh.startswith(f"#compdef {name}\n") and zsh.endswith(f"\n_{name}_completion\n")
+        fish = (share / f"fish/vendor_completions.d/{name}.fish").read_text()
+        assert fish.startswith(f"complete --command {name} ")
+    make("uninstall", tmp_path)
+    left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == {"etc/station/station.env"}
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")
+def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
+    make("install-shell", tmp_path)
+    script = tmp_path / "usr/local/share/bash-completion/completions/station"
+
+    def completed(*words: str) -> list[str]:
+        line = f"source {script}; COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; "
+        line += '_station_completion station; printf "%s\\n" "${COMPREPLY[@]}"'
+        path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+        done = subprocess.run(
+            ["bash", "-c", line], capture_output=True, text=True, env=os.environ | {"PATH": path}
+        )
+        return done.stdout.split()
+
+    assert completed("station", "qu") == ["quit"]
+    assert "--json" in completed("station", "quit", "--")

@@ -171,8 +171,9 @@ def way_to_end(link: socket.socket, path: Path) -> str:
     pid, uid, _ = peer_of(link)
     if not pid or uid != os.getuid():
         return ""
-    where = "" if path == default_socket() else f" --socket {shlex.quote(str(path))}"
-    return f": `station quit{where}`"
+    if path == default_socket():
+        return ": `station quit`"
+    return f": `station quit --socket {shlex.quote(str(path))}`"
 
 
 def user_name(uid: int) -> str:

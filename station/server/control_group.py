@@ -18,11 +18,21 @@ _LOGIN = re.compile(r"((serial-|console-|container-)?getty(@.+)?|ssh(d)?(@.+)?)\
 
 def system_service(pid: int) -> str:
     """Name the system service that a process belongs to; empty: none, or it is not known."""
+    return service_in(_groups(pid))
+
+
+def innermost_service(pid: int) -> str:
+    """Name the innermost service that a process belongs to, also of a user's systemd; empty: none."""
+    parts = [part for line in _groups(pid) for part in line.split("/") if part.endswith(".service")]
+    return parts[-1] if parts else ""
+
+
+def _groups(pid: int) -> list[str]:
+    """Read the lines of /proc/PID/cgroup; none where the process may not be seen."""
     try:
-        lines = Path(f"/proc/{pid}/cgroup").read_text(errors="replace").splitlines()
+        return Path(f"/proc/{pid}/cgroup").read_text(errors="replace").splitlines()
     except OSError:
-        return ""
-    return service_in(lines)
+        return []
 
 
 def service_in(lines: list[str]) -> str:

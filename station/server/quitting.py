@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 from station.cell.errors import RefusedError
 from station.cell.socket_folder import ROOT, user_name
 from station.protocol.stop_client import ArmMotion
 from station.server.approval import Peer
-from station.server.control_group import system_service
+from station.server.control_group import innermost_service, system_service
 from station.session.session import Session
 
 
@@ -23,18 +22,8 @@ def way_of_service(pid: int, notify_socket: str) -> str:
         return f"systemctl stop {service}"
     if not notify_socket:
         return ""
-    unit = _user_unit(pid)
+    unit = innermost_service(pid)
     return f"systemctl --user stop {unit}" if unit else "the command of the program that started it"
-
-
-def _user_unit(pid: int) -> str:
-    """Name the innermost service of a user's systemd that a process belongs to; empty: none."""
-    try:
-        lines = Path(f"/proc/{pid}/cgroup").read_text(errors="replace").splitlines()
-    except OSError:
-        return ""
-    parts = [part for line in lines for part in line.split("/") if part.endswith(".service")]
-    return parts[-1] if parts else ""
 
 
 def require_started_by(caller: Peer, way: str) -> None:

@@ -307,6 +307,7 @@ class Session:
         """Pause after this pose. Any client may, as it never causes motion."""
         self._require_state(verbs.Pause)
         self.context.requests.pause_by = who
+        self.supervisor.monitor.refresh()  # the status tells it before the answer does
         self.store.event("pause-wanted", f"{who} asks to pause after this pose", who=who)
 
     async def finish(self, client_id: int) -> None:
@@ -315,6 +316,7 @@ class Session:
         self.approvals.void()
         if self.store.state in RUNNING and not self.freedrive.taking:
             self.context.requests.finish = True
+            self.supervisor.monitor.refresh()
             self.store.event("finish-wanted", "finish after this pose")
             return
         if self.context.recording is None:

@@ -21,7 +21,7 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
     await rig.go_until_it_moves()
     assert rig.session.store.status.pending == ""
     rig.session.pause("anna")
-    await until(lambda: rig.session.store.status.pending == supervisor.PAUSES)
+    assert rig.session.store.status.pending == supervisor.PAUSES, "told before the answer"
     rig.arm.arrive.set()
     await rig.until(S.PAUSED)
     await until(lambda: rig.session.store.status.pending == "")
@@ -31,7 +31,7 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
     assert rig.arm.log.count("move") == 1, "going on needs a new go"
     await rig.go_until(S.MOVING, purpose=Purpose.RESUME)
     await rig.session.finish(1)
-    await until(lambda: rig.session.store.status.pending == supervisor.FINISHES)
+    assert rig.session.store.status.pending == supervisor.FINISHES
     rig.arm.arrive.set()
     await rig.until(S.IDLE)
     assert len(sealed(rig).views()) == 2

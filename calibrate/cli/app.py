@@ -25,7 +25,7 @@ COMMANDS = {
     ),
     "export": LazyCommand(
         "calibrate.cli.installed:export",
-        "Write a calibration in another program's format, or in a pendant's numbers.",
+        "Write a calibration as another program or pendant reads it.",
         (
             "calibrate export --to ros-launch -o camera.launch.py  # of what is installed",
             "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",

@@ -99,7 +99,7 @@ def export(
     ] = None,
     root: Root = None,
 ) -> None:
-    """Write a calibration in another program's format, or in a pendant's numbers.
+    """Write a calibration as another program or pendant reads it.
 
     The installed one is refused while it is in doubt or withdrawn; unverified, file and stderr say so.
     """

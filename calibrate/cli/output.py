@@ -10,13 +10,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+
 from calibrate.errors import UsageError
 from calibrate.files.folders import VERSION_NAME
 from calibrate.pipeline.recorded_views import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
 from recordings.cli.console import OpenReport as OpenReport
+from recordings.cli.console import ProgressLine, plain_console, progress_bar
 from recordings.cli.console import open_report as open_report
-from recordings.cli.console import plain_console, progress_bar
 from recordings.cli.console import print_json as print_json
 from recordings.files import read_beginning
 from recordings.mcap.records import MAGIC
@@ -51,27 +53,38 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
 
 @contextmanager
 def detection_progress() -> Iterator[LoadProgress | None]:
-    """Show progress on stderr: a bar on a terminal, plain lines with CALIBRATE_PROGRESS=lines."""
+    """Show progress on stderr: a bar on a terminal, a `ProgressLine` each with CALIBRATE_PROGRESS=json."""
     if err.is_terminal:
-        with progress_bar("solving", err) as bar, _stages(lambda told: bar(1, 1, told)):
+        with progress_bar("solving", err) as bar, _stages(lambda stage: bar(1, 1, stage.getMessage())):
             yield bar
-    elif os.environ.get("CALIBRATE_PROGRESS") == "lines":
-        with _stages(lambda told: print(told, file=sys.stderr, flush=True)):
-            yield _progress_line
+    elif os.environ.get("CALIBRATE_PROGRESS") == "json":
+        with _stages(_tell_stage):
+            yield _tell_images
     else:
         yield None
 
 
-def _progress_line(done: int, total: int, name: str) -> None:
-    if done == total or done % 5 == 0:
-        print(f"finding the board: image {done} of {total}", file=sys.stderr, flush=True)
+def _tell(line: ProgressLine) -> None:
+    print(msgspec.json.encode(line).decode(), file=sys.stderr, flush=True)
+
+
+def _tell_stage(stage: logging.LogRecord) -> None:
+    match stage.args:
+        case (int(done), int(total), str(what)):
+            _tell(ProgressLine(what, done, total))
+        case _:
+            _tell(ProgressLine(stage.getMessage()))
+
+
+def _tell_images(done: int, total: int, name: str) -> None:
+    _tell(ProgressLine("finding the board in the images", done, total))
 
 
 @contextmanager
-def _stages(tell: Callable[[str], object]) -> Iterator[None]:
+def _stages(tell: Callable[[logging.LogRecord], object]) -> Iterator[None]:
     """Tell the stages of solving while this lasts."""
     log, handler = logging.getLogger("calibrate.stages"), logging.Handler(logging.INFO)
-    handler.emit = lambda record: tell(record.getMessage())  # type: ignore[method-assign, assignment]
+    handler.emit = lambda record: tell(record)  # type: ignore[method-assign, assignment]
     log.setLevel(logging.INFO)
     log.addHandler(handler)
     try:

@@ -24,7 +24,7 @@ from calibrate.views.view_set import BoardView, Observations, Places, ViewSet, o
 from recordings.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 
 STAGES = logging.getLogger("calibrate.stages")
-"""Tells people who wait what is computed."""
+"""Tells people who wait what is computed: with number of the stage, of how many, and what is done in it."""
 FEWEST_FOR_ARM_ERRORS = 8
 """Fewest views from which errors of the arm can be told from noise."""
 FEWEST_USED = 3
@@ -113,13 +113,13 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, of_class: ArmClass = ARM
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = all_pairs(H, C)
     require_motion(pairs)
-    STAGES.info("1 of 4: the best start, from all pairs of views")
+    STAGES.info("%d of %d: %s", 1, 4, "the best start, from all pairs of views")
     certified = solve_global(pairs)
     start = agreed_start(H, BoardPoses.known(C), seed, certified.X)
     views, turned = set_boards_right(views, start.X, start.Y)
     observed, C = observe_views(views), views.camera_from_board
     state = CellState(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
-    STAGES.info("2 of 4: camera, board and lens together")
+    STAGES.info("%d of %d: %s", 2, 4, "camera, board and lens together")
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
     plain, log_bayes, smooth, failure = found, None, None, ""
@@ -130,7 +130,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, of_class: ArmClass = ARM
         # A pose that is told metres away must neither set the range nor be explained by these errors.
         extent = flange_extent(observed.flange[plain.used])
         smoothly = smooth_motion(observed.flange, extent) * plain.used[:, None, None]
-        STAGES.info("3 of 4: errors of the arm")
+        STAGES.info("%d of %d: %s", 3, 4, "errors of the arm")
 
         def with_errors(by_arm: Array) -> tuple[Observations, Estimate, float | None]:
             seen = replace(observed, by_arm_errors=np.concatenate([by_arm, flex], axis=2))

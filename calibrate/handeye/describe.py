@@ -67,7 +67,7 @@ def describe(fit: CellFit, options: SolveOptions) -> Solution:
     stated = _stated_error(fit, options)
     cell = _fitted_cell(fit, options, stated, distance_m)
     evidence = _evidence(fit)
-    STAGES.info("4 of 4: proof on views left out")
+    STAGES.info("%d of %d: %s", 4, 4, "proof on views left out")
     judgement = _judgement(fit, options, cell, evidence, stated, distance_m)
     return Solution(cell, judgement, evidence, profile="robust", seed=options.seed)
 

@@ -40,6 +40,16 @@ def plain_console(**settings: Any) -> Console:
     return console
 
 
+class ProgressLine(msgspec.Struct, frozen=True, omit_defaults=True, tag_field="kind", tag="progress"):
+    """How far the work is, for a program that shows it: one JSON object a line."""
+
+    what: str
+    """What is done now, in words."""
+    done: int = 0
+    total: int = 0
+    """0: nobody knows how much it is."""
+
+
 @contextmanager
 def progress_bar(label: str, console: Console) -> Iterator[Callable[[int, int, str], None]]:
     """Show a bar until the end. Yields a function to call with done, total and a text."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import sys
 import time
 from typing import ClassVar
 
+import msgspec
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
@@ -16,6 +18,7 @@ from textual.content import Content
 from textual.widgets import Button, Input, Label, RichLog, Static
 
 from calibrate.files.install import reason_problem
+from recordings.cli.console import ProgressLine
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
 from station.protocol.verbs import Go
@@ -23,7 +26,7 @@ from station.tui.frame import Question
 from station.tui.screen import Panel
 from station.tui.task import Action, Known
 from station.tui.widgets.cell_drawing import draw
-from station.tui.words import duration, hanging, limit_bar, lines
+from station.tui.words import MARKS, Mark, dim, duration, hanging, limit_bar, lines
 
 TERMINATE_S = 5.0
 WIDTH, INDENT, ROUND_IT = 64, 10, 6
@@ -161,10 +164,20 @@ class Reason(Question[str]):
 READ = Action("", "Read the result", "It is done; Enter closes this window.", look=True)
 
 
+VERDICTS: dict[int, tuple[Mark, str]] = {
+    0: ("done", "Done"),
+    3: ("look", "Done, with a loss"),
+    4: ("failed", "FAIL"),
+}
+"""Mark and word of an exit code; any other one: it was not done."""
+NOT_DONE: tuple[Mark, str] = ("failed", "Not done")
+
+
 class JobScreen(Question[int]):
     """Runs `python -m MODULE ARGS…` and returns its exit code; Escape ends it (-1).
 
-    What it said stays until it is read, unless the code is one of `close_on`.
+    A bar shows how far it is (`ProgressLine`). At the end stand its verdict and what it said, until they are
+    read, unless the code is one of `close_on`. `passed`: the word of the verdict for exit code 0.
     """
 
     BOX, NAME = "job", "At work"
@@ -174,54 +187,86 @@ class JobScreen(Question[int]):
         Binding("enter", "close", "Close", show=False),
     ]
 
-    def __init__(self, title: str, module: str, *args: str, close_on: tuple[int, ...] = (0, 4)) -> None:
-        super().__init__()
+    def __init__(
+        self, title: str, module: str, *args: str, close_on: tuple[int, ...] = (0, 4), passed: str = ""
+    ) -> None:
+        super().__init__(title)
         self._close_on = close_on
+        self._passed = passed
         self.said: list[str] = []
-        self._title, self._command = title, (sys.executable, "-m", module, *args)
+        """Its lines, without those of progress."""
+        self._command = (sys.executable, "-m", module, *args)
         self._process: asyncio.subprocess.Process | None = None
         self._exit_code: int | None = None
         """Set when all that it said is shown."""
         self._ended = False
         """By a person. It may have been done all the same."""
         self._begun_s = time.monotonic()
+        self._progress = ProgressLine("starting")
 
     def body(self) -> ComposeResult:
-        yield Label(self._title, id="job-title")
+        yield Static(id="job-verdict")
+        yield Static(id="job-bar")
         yield RichLog(id="job-lines", wrap=True, max_lines=500, min_width=0)
 
     def on_mount(self) -> None:
-        self.set_interval(1.0, self._say_how_long)
+        self.query_one("#job-verdict").display = False
+        self.set_interval(1.0, self._show_progress)
         self.call_after_refresh(self.run_job)  # the width of its lines is known then
 
-    def _say_how_long(self) -> None:
-        """Count the seconds, which show that the work goes on while it prints nothing."""
-        if self._exit_code is None:
-            spent = duration(time.monotonic() - self._begun_s)
-            self.query_one("#job-title", Label).update(f"{spent} {self._title} …")
+    def on_resize(self) -> None:
+        self._show_progress()
+
+    def _show_progress(self) -> None:
+        """Draw the bar; the seconds show that the work goes on while it tells nothing."""
+        if self._exit_code is not None:
+            return
+        bar, now = self.query_one("#job-bar", Static), self._progress
+        spent = duration(time.monotonic() - self._begun_s)
+        head = Content.assemble((f"{spent}  ", "bold $strong"), now.what)
+        if not now.total:
+            bar.update(lines(head, Content()))
+            return
+        count = f" {now.done} of {now.total}"
+        cells = max(1, bar.size.width - len(count))
+        bar.update(lines(head, limit_bar(now.done, now.total, cells, "$accent", at=1.0) + dim(count)))
 
     @work(exclusive=True, exit_on_error=False)
     async def run_job(self) -> None:
         lines = self.query_one("#job-lines", RichLog)
         width = str(max(40, lines.scrollable_content_region.width))  # its own line breaks are then ours
+        self._show_progress()
         self._process = await asyncio.create_subprocess_exec(
             *self._command,
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
-            env=os.environ | {"CALIBRATE_PROGRESS": "lines", "PYTHONUNBUFFERED": "1", "COLUMNS": width},
+            env=os.environ | {"CALIBRATE_PROGRESS": "json", "PYTHONUNBUFFERED": "1", "COLUMNS": width},
         )
         assert self._process.stdout is not None
         async for line in self._process.stdout:
+            with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError):
+                self._progress = msgspec.json.decode(line, type=ProgressLine)
+                self._show_progress()
+                continue
             self.said.append(line.decode(errors="replace").rstrip())
             lines.write(self.said[-1])
         self._exit_code = await self._process.wait()
         if self.is_active and (self._ended or self._exit_code in self._close_on):
             self.dismiss(self._exit_code if self._exit_code in self._close_on else -1)
             return
-        self.query_one("#job-title", Label).update(self._title)
+        self._show_verdict(self._exit_code)
         self.NEXT = READ  # the person reads why before it goes away
         self.show(self.known)
+
+    def _show_verdict(self, code: int) -> None:
+        kind, word = VERDICTS.get(code, NOT_DONE)
+        banner = self.query_one("#job-verdict", Static)
+        said = self._passed if self._passed and not code else word
+        banner.update(Content.styled(f"{MARKS[kind][0]} {said}", "bold"))
+        banner.set_classes(f"-{kind}")
+        banner.display = True
+        self.query_one("#job-bar").display = False
 
     def action_close(self) -> None:
         if self._exit_code is not None:

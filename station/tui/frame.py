@@ -157,11 +157,13 @@ def _robot_parts(status: StationStatus, has_control: bool) -> Iterator[Content]:
         yield dim(f"  {duration(status.session.elapsed_s)}")
 
 
-_BACK = {"now": "$strong on $accentbg", "stopped": "$strong on $badbg", "look": "$warn", "done": "$ok"}
+_OPEN = {"stopped": "bold $strong on $badbg"}
+"""Styles of the open step where they are not `_OPEN_USUAL`: alone it has a background."""
+_OPEN_USUAL = "bold $strong on $accentbg"
 
 
 def rail_line(made: tuple[Step, ...], mode: str, width: int) -> Content:
-    """Draw the steps in two lines where there is room, else in one; the open step is underlined."""
+    """Draw the steps in two lines where there is room, else in one; only the open one has a background."""
     if width < RAIL_WIDE:
         parts = []
         for number, step in enumerate(made, start=1):
@@ -172,25 +174,27 @@ def rail_line(made: tuple[Step, ...], mode: str, width: int) -> Content:
     cell = width // len(made)
     names, texts = [], []
     for number, step in enumerate(made, start=1):
-        back = _BACK[step.mark] if step.mark in ("now", "stopped") else ""
         head = f" {MARKS[step.mark][0]} {number} {step.mode.title()}".ljust(cell - 1)
         names += [_step_name(step, mode, head), Content.styled("│", "$line")]
         below = f" {shortened(step.text, cell - 2, parts=True)}".ljust(cell - 1)
-        texts += [Content.styled(below, back or ("$dim" if step.mark != "todo" else "$faint"))]
-        texts.append(Content.styled("│", "$line"))
+        faint = "$dim" if step.mark != "todo" else "$faint"
+        style = _open_style(step) if step.mode == mode else faint
+        texts += [Content.styled(below, style), Content.styled("│", "$line")]
     return Content("").join([*names[:-1], Content("\n"), *texts[:-1]])
 
 
 def _step_name(step: Step, mode: str, text: str) -> Content:
-    style = _BACK.get(step.mark, MARKS[step.mark][1])
-    bold = "bold " if step.mark != "todo" or step.mode == mode else ""
-    name = Content.styled(text, f"{bold}{style}")
     if step.mode == mode:
-        at = text.find(step.mode.title())
-        return name.stylize("underline", at, at + len(step.mode))
+        return Content.styled(text, _open_style(step))
+    bold = "bold " if step.mark != "todo" else ""
+    name = Content.styled(text, f"{bold}{MARKS[step.mark][1]}")
     if mode in DIGITS:  # a question is answered first
         name = name.stylize(Style.from_meta({"@click": f"app.switch_mode('{step.mode}')"}))
     return name
+
+
+def _open_style(step: Step) -> str:
+    return _OPEN.get(step.mark, _OPEN_USUAL)
 
 
 def next_line(action: Action, width: int) -> Content:

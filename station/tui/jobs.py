@@ -42,7 +42,7 @@ async def recover_session(link: DaemonLink, folder: str) -> None:
 async def check_session(link: DaemonLink, recording: str, folder: str) -> None:
     """Check the installed calibration against this recording; the verdict stays until a person closes it."""
     title, arguments = f"Drift check on {Path(folder).name}", check_arguments(recording, folder)
-    await link.ask_person(JobScreen(title, "calibrate.cli", *arguments, close_on=()))
+    await link.ask_person(JobScreen(title, "calibrate.cli", *arguments, close_on=(), passed="PASS"))
 
 
 async def check_drift(link: DaemonLink, approves: Approve) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from textual import work
+from textual import events, work
 from textual.app import ComposeResult
 from textual.binding import ActiveBinding, Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
@@ -297,6 +297,11 @@ class ResultScreen(StationScreen):
             self.query_one("#checks", Rows).show([cells for cells, _, _ in self._rows])
             self._show_views(result.path, calibration)
             self.query_one("#evidence", Static).update(evidence(result, calibration))
+
+    def on_descendant_focus(self, event: events.DescendantFocus) -> None:
+        """Mark a row of the table alone that the keys work on."""
+        for table in self.query(Rows):
+            table.show_cursor = table is event.widget
 
     def on_resize(self) -> None:
         """Name the tables' keys beside their titles where they have no lower border."""

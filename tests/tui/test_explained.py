@@ -104,3 +104,16 @@ async def test_enter_on_the_evidence_explains_its_words(link: FakeLink, tmp_path
 def test_a_word_is_found_whole_and_in_any_case() -> None:
     assert [word.term for word in words_in("Shift: 1σ of the HASH")] == ["hash", "1σ"]
     assert words_in("rehash") == ()
+
+
+async def test_only_the_table_that_the_keys_work_on_marks_a_row(link: FakeLink, tmp_path: Path) -> None:
+    def marking() -> list[str]:
+        return [str(table.id) for table in pilot.app.screen.query(DataTable) if table.show_cursor]
+
+    async with opened(link, size=(120, 36)) as pilot:
+        await on_result(pilot, tmp_path, GOOD)
+        await until(pilot, lambda: marking() == ["checks"])
+        await pilot.press("v")
+        await until(pilot, lambda: marking() == ["views"])
+        pilot.app.screen.query_one("#evidence-box").focus()
+        await until(pilot, lambda: marking() == [])

@@ -7,12 +7,16 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 from textual.pilot import Pilot
-from textual.widgets import Label, RichLog
+from textual.widgets import RichLog
 
+from recordings.cli.console import ProgressLine
 from station.tui.dialogs import READ, JobScreen
+from station.tui.words import BAR, MARKS, Mark
 from tests.tui.conftest import FakeLink, app_on, text_of, until
 
 
@@ -33,12 +37,12 @@ def pid_file(job: Path) -> Path:
 
 @asynccontextmanager
 async def running(
-    link: FakeLink, *args: str, size: tuple[int, int] = (80, 24)
+    link: FakeLink, *args: str, size: tuple[int, int] = (80, 24), **more: Any
 ) -> AsyncIterator[tuple[Pilot[None], JobScreen, list[int | None]]]:
     """The screen at work on the module, and the exit codes that it came back with."""
     codes: list[int | None] = []
     async with app_on(link).run_test(size=size) as pilot:
-        screen = JobScreen("Working", "some_job", *args)
+        screen = JobScreen("Working", "some_job", *args, **more)
         await pilot.app.push_screen(screen, codes.append)
         yield pilot, screen, codes
 
@@ -70,12 +74,34 @@ async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, jo
         assert codes == [1]
 
 
+async def test_a_bar_shows_how_far_it_is_and_no_line_of_a_shell(link: FakeLink, job: Path) -> None:
+    line = msgspec.json.encode(ProgressLine("finding the board", 12, 25)).decode()
+    job.write_text(f"import time; print('{line}', flush=True); time.sleep(600)")
+    async with running(link) as (pilot, screen, _codes):
+        await until(pilot, lambda: "12 of 25" in text_of(pilot.app, "#job-bar"))
+        assert "finding the board" in text_of(pilot.app, "#job-bar") and BAR in text_of(pilot.app, "#job-bar")
+        assert screen.said == []
+
+
+@pytest.mark.parametrize(("code", "kind"), [(0, "done"), (1, "failed"), (3, "look"), (4, "failed")])
+async def test_the_verdict_is_by_the_exit_code_alone(
+    link: FakeLink, job: Path, code: int, kind: Mark
+) -> None:
+    job.write_text(f"print('PASS, or was it FAIL?'); raise SystemExit({code})")
+    async with running(link, close_on=()) as (pilot, screen, _codes):
+        await until(pilot, lambda: READ.label in text_of(pilot.app, "#next"))
+        banner = screen.query_one("#job-verdict")
+        assert banner.display and banner.has_class(f"-{kind}")
+        assert text_of(pilot.app, "#job-verdict").startswith(MARKS[kind][0])
+        assert not screen.query_one("#job-bar").display
+
+
 async def test_cancelling_ends_the_process(link: FakeLink, pid_file: Path) -> None:
     async with running(link) as (pilot, screen, codes):
         await until(pilot, lambda: pid_file.exists() and pid_file.read_text())
         screen._begun_s = time.monotonic() - 65.0
-        screen._say_how_long()  # seconds tell that it works
-        assert "1:05 Working …" in str(screen.query_one("#job-title", Label).render())
+        screen._show_progress()  # seconds tell that it works
+        assert "1:05" in text_of(pilot.app, "#job-bar")
         await pilot.press("enter")  # by mistake: a second one after the question that began it
         await pilot.pause()
         assert codes == []

@@ -17,8 +17,9 @@ from textual.widgets import Input
 from calibrate.check.history import CheckEntry
 from calibrate.files.calibration import Calibration
 from calibrate.files.validity import Validity, ValidityReason, ValidityState
-from calibrate.results import Gate, PointError, RejectedView, Sense
+from calibrate.results import Gate, PointError, RejectedView, Sense, ViewQuality, ViewWeight
 from calibrate.words import word_of, words_of_gates
+from recordings.cli.console import ProgressLine
 from recordings.schema.messages import RobotIdentity
 from station.cell.session_folder import SessionSummary
 from station.cell.status import (
@@ -36,7 +37,7 @@ from station.operate.draft import CellStep
 from station.protocol.results import Installed, Kept, Result
 from station.protocol.verbs import Check, ResultData, SessionsData
 from station.tui.app import StationApp
-from station.tui.dialogs import ConfirmFinish, ConfirmMotion, JobScreen, Reason
+from station.tui.dialogs import READ, ConfirmFinish, ConfirmMotion, JobScreen, Reason
 from station.tui.help import Explained, Help
 from station.tui.jobs import install_question
 from station.tui.new_cell import NewCell
@@ -98,6 +99,16 @@ def one_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     stands = SimpleNamespace(monotonic=lambda: 1000.0)
     monkeypatch.setattr("station.tui.dialogs.time", stands)
     monkeypatch.setattr(Input, "cursor_blink", False, raising=False)
+
+
+PROGRESS = msgspec.json.encode(ProgressLine("finding the board in the images", 12, 25)).decode()
+WORK = {
+    "work-under-way": ["import time", f"print('{PROGRESS}', flush=True)", "time.sleep(600)"],
+    "work-passed": ["print('The camera pose holds on 8 new views.')"],
+    "work-failed": ["print('Camera shift 1.31 mm, 0.210°.')", "raise SystemExit(4)"],
+    "work-not-done": ["print('No board in any view.')", "raise SystemExit(1)"],
+}
+"""Programs that a work window runs, by the name of the snapshot."""
 
 
 def fresh() -> StationStatus:
@@ -177,8 +188,10 @@ def solved(gates: list[Gate], rejected: Sequence[RejectedView] = ()) -> Calibrat
         point=POINT,
         predicted_error_mm=POINT.error_mm,
         working_distance_m=POINT.at_m,
+        views=[ViewQuality(k, 0.12 + 0.012 * k, 0.05 + 0.007 * k, 0.004 + 0.0005 * k) for k in range(25)],
     )
-    views = msgspec.structs.replace(GOOD.views, rejected=list(rejected))
+    weights = [ViewWeight(k, 1.0 if k < 23 else 0.61) for k in range(25)]
+    views = msgspec.structs.replace(GOOD.views, rejected=list(rejected), weights=weights)
     return msgspec.structs.replace(GOOD, quality=quality, views=views)
 
 
@@ -278,6 +291,7 @@ SHOTS: dict[str, Shot] = {
     "capture-playback": Shot(msgspec.structs.replace(planned(captured=9), source="playback")),
     "result-none": Shot(planned(captured=25, recording="/s/1/r.mcap"), "result"),
     "result-pass": after(GOOD_RESULT),
+    "result-marked": after(GOOD_RESULT, keys=("v", "down", "x")),
     "result-fail": after(Result("/s/1/c.yaml", FAILED)),
     "result-reason": after(Result("/s/1/c.yaml", PASSED, objections=("Regression: 0.31 mm (limit 0.20)",))),
     "result-touched": after(Result("/s/1/c.yaml", msgspec.structs.replace(PASSED, verification=[OFF]))),
@@ -340,22 +354,21 @@ async def test_a_screen_looks_as_it_did(link: FakeLink, name: str) -> None:
         await compare(pilot, name)
 
 
+@pytest.mark.parametrize("name", WORK)
 async def test_long_work_looks_as_it_did(
-    link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    (tmp_path / "some_job.py").write_text(
-        "print('25 views are read'); print('FAIL: rotation_deg'); raise SystemExit(1)"
-    )
+    (tmp_path / "some_job.py").write_text("\n".join(WORK[name]))
     shot = Shot(planned(captured=25, recording="/s/1/r.mcap"))
     tell(link, shot)
     app = app_on(link)
     async with app.run_test(size=SIZES[0]) as pilot:
         await until(pilot, lambda: knows(app, shot))
-        work = JobScreen("Solving 20260920-101500-cell", "some_job")
+        work = JobScreen("Drift check on 20260920-101500-cell", "some_job", close_on=(), passed="PASS")
         await app.push_screen(work)
-        await until(pilot, lambda: work.NEXT.label == "Read the result")
-        await compare(pilot, "work-ended")
+        await until(pilot, lambda: work.NEXT is READ or "12 of 25" in text_of(app, "#job-bar"))
+        await compare(pilot, name)
 
 
 class NoHardware:
@@ -379,5 +392,5 @@ async def test_a_step_of_the_wizard_looks_as_it_did(tmp_path: Path, step: CellSt
 
 def test_every_snapshot_has_its_test() -> None:
     wizard = [f"wizard-{step.value}" for step in CellStep if step in PAGES and step is not CellStep.SAVE]
-    expected = {f"{name}-{w}x{h}.txt" for name in [*SHOTS, "work-ended", *wizard] for w, h in SIZES}
+    expected = {f"{name}-{w}x{h}.txt" for name in [*SHOTS, *WORK, *wizard] for w, h in SIZES}
     assert {path.name for path in FOLDER.iterdir()} == expected

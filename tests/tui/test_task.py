@@ -101,6 +101,8 @@ def test_rail_names_every_step_and_marks_one_now(known: Known, width: int) -> No
     assert all(step.mode.title() in line.plain for step in made)
     latched = known.status is not None and known.status.state in (StationState.STOPPED, StationState.FAULT)
     assert sum(step.mark == "stopped" for step in made) == latched
+    backs = [line.plain[span.start : span.end] for span in line.spans if " on $" in str(span.style)]
+    assert backs and all("Plan" in text or text.strip() == made[1].text for text in backs), "marked once"
 
 
 @given(

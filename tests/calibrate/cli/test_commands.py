@@ -23,6 +23,7 @@ from calibrate.files.install import install
 from calibrate.files.touch import Touch
 from calibrate.files.validity import ValidityState
 from calibrate.files.versions import note_installed
+from recordings.cli.console import ProgressLine
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from tests.calibrate.calling import refused, run
 from tests.calibrate.sessions import Scene, shifted, write_session
@@ -33,7 +34,7 @@ from tests.patience import wait_until
 def test_solve_json_says_what_the_file_holds(
     small_session_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CALIBRATE_PROGRESS", "lines")  # as the screen asks for them
+    monkeypatch.setenv("CALIBRATE_PROGRESS", "json")  # as the screen asks for it
     (tmp_path / "xdg-open").write_text('#!/bin/sh\ncp "$1" opened.new && mv opened.new opened\n')
     (tmp_path / "xdg-open").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
@@ -41,7 +42,9 @@ def test_solve_json_says_what_the_file_holds(
     done = run("solve", small_session_file, "-o", tmp_path / "c.yaml", "--json", "--open", cwd=tmp_path)
     assert done.returncode in (0, 4), done.stderr
     assert done.stdout.count("\n") == 1
-    assert "5 of 5" in done.stderr and "4 of 4" in done.stderr
+    told = [msgspec.json.decode(line, type=ProgressLine) for line in done.stderr.splitlines()]
+    whole = {line.total for line in told if line.done == line.total}
+    assert whole == {5, 4}, "all images, and all stages of solving"
     wait_until((tmp_path / "opened").exists)
     assert (tmp_path / "opened").read_text().startswith("<!doctype html>")
     answer = json.loads(done.stdout)

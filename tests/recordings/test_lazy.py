@@ -55,7 +55,7 @@ def test_a_missing_extra_is_named_in_one_line() -> None:
         "import sys; sys.modules['textual'] = None\n"
         "from recordings.cli.lazy import LazyCommand, LazyGroup, run\n"
         "sys.argv = ['x', 'screen']\n"
-        "run('x', LazyGroup({'screen': LazyCommand('textual.app:App', 'a screen')}, '', ''))"
+        "run('x', LazyGroup({'screen': LazyCommand('textual.app:App', 'a screen')}, '', '', {}, {}))"
     )
     assert done.returncode == 2
     assert "calibration-station[station]" in done.stderr and len(done.stderr.splitlines()) == 1

@@ -24,6 +24,7 @@ from textual.app import App
 from textual.pilot import Pilot
 
 from station.tui.themes import THEMES
+from station.tui.widgets.preview import QUADRANTS
 from tests.tui.conftest import until
 
 FOLDER = Path(__file__).with_name("snapshots")
@@ -108,7 +109,7 @@ class Names:
     def letter(self, dark: Cell, light: Cell) -> tuple[str, str]:
         """Name attributes and colour of a letter, and its background."""
         colour = self.of(dark.colour, light.colour)
-        if dark.sign == "▀" and colour not in OWN:
+        if dark.sign in QUADRANTS[1:] and colour not in OWN:
             return "picture", USUAL_BACK
         return " ".join((*dark.attributes, *[colour] * (colour != USUAL))), self.of(dark.back, light.back)
 

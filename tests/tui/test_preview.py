@@ -10,13 +10,16 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from textual._compositor import Compositor
 from textual.pilot import Pilot
 
 from station.cell.status import StationState
 from station.tui.dialogs import ConfirmMotion
-from station.tui.widgets.preview import PreviewPane, sharp_widget
+from station.tui.widgets.preview import LEVELS, QUADRANTS, YELLOW, PreviewPane, quadrants, sharp_widget
 from tests.tui.conftest import FakeLink, app_on, idle, opened, until, with_robot
 
 VT340, PLAIN = b"\x1b[?63;1;2;4;6;9;15;22c", b"\x1b[?62;22c"
@@ -47,7 +50,7 @@ async def test_half_blocks_while_something_stands_over_it_and_while_the_arm_work
         link.show(idle(StationState.MOVING))
         await until(pilot, lambda: not sharp(pilot))
         preview = pilot.app.screen.query_one(PreviewPane)
-        assert "▀" in preview.render_line(preview.size.height // 2).text
+        assert set(preview.render_line(preview.size.height // 2).text) & set(QUADRANTS[1:])
         link.show(idle())
         await until(pilot, lambda: sharp(pilot))
         await pilot.press("f5")
@@ -105,11 +108,52 @@ def test_without_the_extra_nothing_is_missed(terminal: int, monkeypatch: pytest.
     assert sharp_widget() is None
 
 
-@pytest.mark.parametrize(("theme", "marks"), [("terminal", "░▒▓█"), ("station-dark", "▀")])
-async def test_the_picture_needs_no_grey_background_on_a_console(
-    link: FakeLink, theme: str, marks: str, monkeypatch: pytest.MonkeyPatch
+@given(data=st.data())
+def test_cells_of_two_shades_show_every_picture_element(data: st.DataObject) -> None:
+    """Drawn back by the characters' own shapes."""
+    shade = st.integers(0, LEVELS - 1)
+    dark, light = sorted((data.draw(shade), data.draw(shade)))
+    element = st.sampled_from([dark, light])
+    cell = data.draw(st.lists(element, min_size=4, max_size=4))
+    (number,) = quadrants(np.array([[cell]])).ravel().tolist()
+    bits, shades = divmod(number, (LEVELS + 1) ** 2)
+    upper, lower = divmod(shades, LEVELS + 1)
+    assert [upper if SHAPES[QUADRANTS[bits]][k] else lower for k in range(4)] == cell
+
+
+SHAPES = {
+    " ": (0, 0, 0, 0), "▘": (1, 0, 0, 0), "▝": (0, 1, 0, 0), "▀": (1, 1, 0, 0), "▖": (0, 0, 1, 0),
+    "▌": (1, 0, 1, 0), "▞": (0, 1, 1, 0), "▛": (1, 1, 1, 0), "▗": (0, 0, 0, 1), "▚": (1, 0, 0, 1),
+    "▐": (0, 1, 0, 1), "▜": (1, 1, 0, 1), "▄": (0, 0, 1, 1), "▙": (1, 0, 1, 1), "▟": (0, 1, 1, 1),
+    "█": (1, 1, 1, 1),
+}  # fmt: skip
+"""Character → upper left, upper right, lower left, lower right, as Unicode names them."""
+
+
+async def test_the_wanted_view_is_a_line_that_covers_little_of_the_picture(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(120, 36)) as pilot:
+        preview = pilot.app.screen.query_one(PreviewPane)
+        await until(pilot, lambda: preview._image is not None)
+        preview.wanted = ((0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
+        segments = [part for y in range(preview.size.height) for part in preview.render_line(y)]
+        lined = [part for part in segments if part.style and part.style.color == YELLOW]
+        assert len(lined) > 10
+        assert "█" not in "".join(part.text for part in lined)
+
+
+@pytest.mark.parametrize(
+    ("theme", "terminal_name", "marks"),
+    [
+        ("terminal", "linux", "░▒▓█"),
+        ("station-dark", "linux", "▀▄█"),
+        ("station-dark", "xterm-256color", QUADRANTS),
+    ],
+)
+async def test_the_picture_needs_no_more_than_the_terminal_draws(
+    link: FakeLink, theme: str, terminal_name: str, marks: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TEXTUAL_THEME", theme)
+    monkeypatch.setenv("TERM", terminal_name)
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         preview = pilot.app.screen.query_one(PreviewPane)
         await until(pilot, lambda: preview._image is not None)

@@ -1,4 +1,4 @@
-"""The camera's image and its found corners: half blocks on any terminal, sharp where it can draw them."""
+"""The camera's image and its found corners: block characters, or sharp where the terminal can draw that."""
 
 from __future__ import annotations
 
@@ -33,15 +33,23 @@ from station.tui.themes import TERMINAL, chosen_theme
 SHARP_S = 1.0
 """Between two sharp images at least: drawing one takes up to 0.1 s of the processor."""
 LEVELS = 20
-"""Shades a terminal image is drawn with: fewer styles to send, and no eye sees more in half blocks."""
+"""Shades a terminal image is drawn with: fewer styles to send, and no eye sees more in blocks."""
 GREYS = 16
 """Shades of a sharp image: its bytes grow with them."""
+QUADRANTS = " ▘▝▀▖▌▞▛▗▚▐▜▄▙▟█"
+"""Two by two picture elements: bit 0 is the upper left one, 1 the upper right one, 2 and 3 those below."""
+_BITS = 1 << np.arange(4)
+_FULL = len(QUADRANTS) - 1
+"""Cell of one shade: its character and its background are alike."""
 _CORNER, _WANTED = -1, -2
-"""Cells that show a corner, or the outline of the wanted view, in place of shades."""
+"""Cells that show a corner, or where few colours are drawn the wanted view's outline, in place of shades."""
+_LINE = LEVELS
+"""The shade after the last: that of the wanted view's outline."""
 _BLACK = Color.from_rgb(0, 0, 0)
+YELLOW = Color.from_rgb(255, 200, 0)
 SIGNS = {
     _CORNER: Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=_BLACK, bold=True)),
-    _WANTED: Segment("o", Style(color=Color.from_rgb(255, 200, 0), bgcolor=_BLACK, bold=True)),
+    _WANTED: Segment("o", Style(color=YELLOW, bgcolor=_BLACK, bold=True)),
 }
 """Signs, and not only colours."""
 OLD = "OLD IMAGE"
@@ -82,7 +90,7 @@ class PreviewPane(Widget):
     """
 
     sharp: ClassVar[Any] = None
-    """The widget for sharp images; None: half blocks only."""
+    """The widget for sharp images; None: blocks only."""
     old: reactive[bool] = reactive(False)
     """The image is out of date; written across it."""
     dated: reactive[bool] = reactive(False)
@@ -168,7 +176,7 @@ class PreviewPane(Widget):
             cv2.polylines(image, [places], True, colour, thickness)
 
     def soften(self) -> None:
-        """Show half blocks: a sharp image would hide what is drawn over it."""
+        """Show blocks: a sharp image would hide what is drawn over it."""
         for child in self.children:
             child.display = False
 
@@ -190,9 +198,9 @@ class PreviewPane(Widget):
         self.soften()
 
     def _cell(self) -> tuple[int, int]:
-        """Width and height of one character in pixels, or what stands for them in half blocks."""
+        """Width and height of one character in pixels, or what stands for them in blocks."""
         if not self._sharp():
-            return 1, 2
+            return 2, 4
         cell: tuple[int, int] = importlib.import_module("textual_image._terminal").get_cell_size()
         return cell
 
@@ -210,33 +218,87 @@ class PreviewPane(Widget):
             return Strip([Segment(OLD.center(self.size.width), Style(reverse=True, bold=True))])
         return self._rows[y] if y < len(self._rows) else Strip.blank(self.size.width, self.rich_style)
 
+    def _blocks(self, rows: int, columns: int) -> list[list[int]]:
+        """Draw the image, and the wanted view's outline, in cells of `quadrants`."""
+        assert self._image is not None
+        across = 2 if has_quadrants() else 1
+        small = cv2.resize(self._image, (across * columns, 2 * rows), interpolation=cv2.INTER_AREA)
+        levels = small.astype(int) * LEVELS // 256
+        lined = np.zeros(levels.shape, np.uint8)
+        self._outline(lined, (1,))
+        levels[lined > 0] = _LINE
+        levels = np.repeat(levels, 2 // across, axis=1)
+        cells = levels.reshape(rows, 2, columns, 2).swapaxes(1, 2).reshape(rows, columns, 4)
+        encoded: list[list[int]] = quadrants(cells).tolist()
+        return encoded
+
+    def _dithered(self, rows: int, columns: int) -> list[list[int]]:
+        """Draw the image in cells of `FEW_SHADES`, and the wanted view's outline in signs."""
+        assert self._image is not None
+        small = cv2.resize(self._image, (columns, rows), interpolation=cv2.INTER_AREA)
+        thresholds = np.tile(_BAYER, (rows // 4 + 1, columns // 4 + 1))[:rows, :columns]
+        cells = (small / 255 * (len(FEW_SHADES) - 1) + thresholds).astype(int)
+        lined = np.zeros(cells.shape, np.uint8)
+        self._outline(lined, (1,))
+        encoded: list[list[int]] = np.where(lined > 0, _WANTED, cells).tolist()
+        return encoded
+
     def _draw(self, size: Size) -> list[Strip]:
         if self._image is None or size.width < 2 or size.height < 1:
             words = Segment("no image yet".center(size.width), self.rich_style)
             return [Strip([words])] if size.width else []
         height, width = self._image.shape
+        # A character is twice as high as it is wide.
         scale = min(size.width / width, 2 * size.height / height)
-        columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
-        small = cv2.resize(self._image, (columns, rows), interpolation=cv2.INTER_AREA)
-        shades = (small.astype(int) * LEVELS // 256).reshape(rows // 2, 2, columns)
+        columns = max(1, int(width * scale))
+        rows = max(1, int(height * scale) // 2)
         few = None
         if self.app.current_theme.ansi:
             # White on black, so that light is light on a white terminal too.
             few = Style() if self.app.no_color else Style(color="white", bgcolor="black")
-        dark = np.tile(_BAYER, (rows // 8 + 1, columns // 4 + 1))[: rows // 2, :columns]
-        dithered = small.reshape(shades.shape).mean(axis=1) / 255 * (len(FEW_SHADES) - 1) + dark
-        cells = (shades[:, 0] * LEVELS + shades[:, 1] if few is None else dithered.astype(int)).tolist()
-        lined = np.zeros((rows // 2, columns), np.uint8)
-        self._outline(lined, (1,))
-        for row, column in np.argwhere(lined).tolist():
-            cells[row][column] = _WANTED
+            cells = self._dithered(rows, columns)
+        else:
+            cells = self._blocks(rows, columns)
         for x, y in () if self.dated else self._corners:
-            row, column = int(y * rows) // 2, int(x * columns)
-            if 0 <= row < rows // 2 and 0 <= column < columns:
+            row = int(y * rows)
+            column = int(x * columns)
+            if 0 <= row < rows and 0 <= column < columns:
                 cells[row][column] = _CORNER
         left = (size.width - columns) // 2
         sides = [Segment(" " * room, self.rich_style) for room in (left, size.width - columns - left)]
         return [Strip([sides[0], *_runs(line, few), sides[1]], size.width) for line in cells]
+
+
+def has_quadrants() -> bool:
+    """Tell whether the terminal's font has quadrants; a Linux console's has halves alone."""
+    return os.environ.get("TERM") != "linux"
+
+
+def quadrants(levels: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Make cells (rows, columns) of picture elements (rows, columns, 4) from 0 to `LEVELS` - 1, or `_LINE`.
+
+    Each cell has two shades, the means of its elements on either side of the middle between the darkest and
+    the lightest one; the outline's is the upper of the two wherever it passes. Encoded as
+    (bits · (LEVELS + 1) + upper) · (LEVELS + 1) + lower.
+    """
+    is_line = levels == _LINE
+    shades = np.where(is_line, 0, levels)
+    has_line = is_line.any(axis=2, keepdims=True)
+    middle = (shades.min(axis=2, keepdims=True) + shades.max(axis=2, keepdims=True)) / 2
+    upper = np.where(has_line, is_line, shades > middle)
+    high = _mean(shades, upper)
+    low = _mean(shades, ~upper)
+    high = np.where(has_line[..., 0], _LINE, np.where(upper.any(axis=2), high, low))
+    bits = np.where(upper.any(axis=2), upper @ _BITS, _FULL)
+    cells: NDArray[np.int_] = (bits * (LEVELS + 1) + high) * (LEVELS + 1) + low
+    return cells
+
+
+def _mean(shades: NDArray[np.int_], chosen: NDArray[np.bool_]) -> NDArray[np.int_]:
+    """Average (rows, columns, 4) over the chosen elements of each cell; 0 where none is."""
+    total = (shades * chosen).sum(axis=2)
+    mean: NDArray[np.int_] = np.rint(total / np.maximum(chosen.sum(axis=2), 1)).astype(int)
+    return mean
 
 
 def _runs(line: list[int], few: Style | None) -> list[Segment]:
@@ -249,11 +311,19 @@ def _runs(line: list[int], few: Style | None) -> list[Segment]:
         elif few is not None:
             runs.append(Segment(FEW_SHADES[cell] * count, few))
         else:
-            runs.append(Segment("▀" * count, _style(cell)))
+            bits, shades = divmod(cell, (LEVELS + 1) ** 2)
+            runs.append(Segment(QUADRANTS[bits] * count, _style(shades)))
     return runs
 
 
-@lru_cache(maxsize=LEVELS * LEVELS)
-def _style(cell: int) -> Style:
-    top, bottom = (round(shade * 255 / (LEVELS - 1)) for shade in divmod(cell, LEVELS))
-    return Style(color=Color.from_rgb(top, top, top), bgcolor=Color.from_rgb(bottom, bottom, bottom))
+@lru_cache(maxsize=(LEVELS + 1) ** 2)
+def _style(shades: int) -> Style:
+    upper, lower = (_colour(shade) for shade in divmod(shades, LEVELS + 1))
+    return Style(color=upper, bgcolor=lower)
+
+
+def _colour(shade: int) -> Color:
+    if shade == _LINE:
+        return YELLOW
+    grey = round(shade * 255 / (LEVELS - 1))
+    return Color.from_rgb(grey, grey, grey)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks.misread_poses import MISREAD, said
+from calibrate.arms.classes import ARM_CLASSES
 from calibrate.files import exports
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
@@ -270,7 +271,9 @@ def test_who_the_arm_is_is_kept_as_it_was_told(put: Callable[..., Path], tmp_pat
     folder, out = put(kuka), tmp_path / "mine.mcap"
     told = call(main, "import", folder, "-o", out, "--mount", "eye-in-hand", "--arm-class", "seven-joints")
     assert told.returncode == 0, told.stderr
-    assert "4 mm and 5 mrad" in told.stdout, "what is assumed as no joints are recorded"
+    seven = ARM_CLASSES["seven-joints"]
+    assumed = f"{1e3 * seven.shift_m:g} mm and {1e3 * seven.turn_rad:g} mrad"
+    assert assumed in told.stdout, "what is assumed as no joints are recorded"
     assert open_recording(out).info.robot == RobotIdentity(arm_class="seven-joints")
     out.unlink()
     assert call(main, "import", folder, "-o", out).returncode == 0

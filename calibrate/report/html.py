@@ -74,16 +74,17 @@ def figure(drawn: str, caption: str, question: str = "") -> str:
 
 
 def bars(values: Mapping[int, float], unit: str, limit: float | None = None) -> str:
-    """Draw a bar for each pose index, the largest in another colour, and the limit where it is near.
+    """Draw a bar for each pose index, those over the limit in another colour; the limit where it is near.
 
     The scale's end is told in `unit`; every bar tells its value under the mouse.
     """
-    first, last, largest = min(values), max(values), max(values, key=lambda index: values[index])
-    near = limit if limit is not None and values[largest] > 0.3 * limit else 0.0
-    top, poses = max(values[largest], near), last - first + 1
+    first, last, largest = min(values), max(values), max(values.values())
+    near = limit if limit is not None and largest > 0.3 * limit else 0.0
+    top, poses = max(largest, near), last - first + 1
     drawn = []
     for index, value in values.items():
-        kind, told = "largest" * (index == largest), f"pose {index + 1}: {value:.2f} {unit}"
+        kind = "over" if limit is not None and value > limit else ""
+        told = f"pose {index + 1}: {value:.2f} {unit}"
         place = f'x="{index - first + 0.1:.1f}" y="{top - value:.4g}" width="0.8" height="{value:.4g}"'
         drawn.append(f'<rect class="{kind}" {place}><title>{told}</title></rect>')
     if near:

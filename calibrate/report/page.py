@@ -28,7 +28,7 @@ from calibrate.files.formatting import (
 from calibrate.pipeline.job import SolvedRecording
 from calibrate.report import html
 from calibrate.report.annotate import placed_corners
-from calibrate.views.projection import intrinsics_names, intrinsics_vector, project_at
+from calibrate.views.projection import camera_matrix, intrinsics_names, intrinsics_vector, project_at
 from calibrate.views.view_set import board_in_camera
 from recordings import strict_yaml
 from recordings.geometry import Array, difference
@@ -40,7 +40,7 @@ _FIRST_WIDTH_PX, _OTHER_WIDTH_PX, _PICTURES_LIMIT = 720, 320, 12
 _REMEDIES_SHOWN = 3
 _DRAWN_IN = (255, 140, 20)
 """Colour of what the calibration predicts: blue, green, red."""
-_AHEAD_PX = 1e6
+_AHEAD_MM = 1e6
 """More than any residual: sorts rejected and suspect views before all others."""
 
 
@@ -115,18 +115,18 @@ def _picture(job: SolvedRecording) -> str:
     if not used:
         return ""
     view = max(used, key=lambda view: _placed(job, view)[2])
-    picture, off_px = _drawn_in(job, view, _FIRST_WIDTH_PX)
+    picture, off_mm = _drawn_in(job, view, _FIRST_WIDTH_PX)
     return html.figure(
         picture,
         "Blue: the board where this calibration and the robot's pose place it. That is at most "
-        f"{off_px:.2f} px (rms) beside the board in the image, here in pose {view.index + 1}.",
+        f"{off_mm:.2f} mm beside the board in the image, here in pose {view.index + 1}.",
     )
 
 
 def _placed(job: SolvedRecording, view: View) -> tuple[Array, Array, float]:
     """Where robot pose, camera pose and board pose place the board: outline and corners (…, 2), px.
 
-    The third: how far that is from the corners in the image, px rms.
+    The third: how far that is from the corners in the image, at the board's distance, mm rms.
     """
     calibration, board = job.calibration, board_points(job.calibration.board)
     seen = job.loaded.detections[view.index]
@@ -140,15 +140,18 @@ def _placed(job: SolvedRecording, view: View) -> tuple[Array, Array, float]:
         return np.nan_to_num(project_at(calibration.intrinsics.model, C, points))
 
     off = np.nan_to_num(placed_corners(calibration, view.base_from_flange, seen)) - seen.corners.pixels
-    return shown_at(outline), shown_at(board), float(np.sqrt(np.square(off).sum(axis=1).mean()))
+    off_px = float(np.sqrt(np.square(off).sum(axis=1).mean()))
+    distance_m = float((board @ C[2, :3] + C[2, 3]).mean())
+    focal_px = float(np.diag(camera_matrix(calibration.intrinsics.model))[:2].mean())
+    return shown_at(outline), shown_at(board), 1e3 * off_px * distance_m / focal_px
 
 
 def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, float]:
-    """A view with the board as it is placed; how far off it is, px rms.
+    """A view with the board as it is placed; how far off it is, mm rms.
 
     A board that is small in the image is shown with its surroundings only.
     """
-    outline, board, off_px = _placed(job, view)
+    outline, board, off_mm = _placed(job, view)
     image, seen = job.recording.image(view), job.loaded.detections[view.index]
     pixels = to_grey(viewable(image.pixels, image.pixel_format))
     size = np.array(pixels.shape[::-1])
@@ -166,7 +169,7 @@ def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, flo
     for dot in sixteenths[1].tolist():
         cv2.circle(canvas, dot, width_px // 11, _DRAWN_IN, 2, cv2.LINE_AA, 4)
     jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 65])[1].tobytes()
-    return html.picture(jpeg, f"pose {view.index + 1} with the board drawn in"), off_px
+    return html.picture(jpeg, f"pose {view.index + 1} with the board drawn in"), off_mm
 
 
 def rehearsal_text(job: SolvedRecording) -> str:
@@ -263,14 +266,14 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         seen = job.loaded.detections.get(view.index)
         if seen is None or not seen.found:  # the table above says why
             continue
-        picture, off_px = _drawn_in(job, view, _OTHER_WIDTH_PX)
-        caption = f"pose {view.index + 1}: {off_px:.2f} px"
+        picture, off_mm = _drawn_in(job, view, _OTHER_WIDTH_PX)
+        caption = f"pose {view.index + 1}: {off_mm:.2f} mm"
         if view.index in left_out:
             caption += ", rejected"
         elif view.index in suspects:
             caption += f", suspect: P(outlier) {suspects[view.index]:.0%}"
         rank = (view.index in left_out) + suspects.get(view.index, 0.0)
-        figures[rank * _AHEAD_PX + off_px] = html.figure(picture, caption)
+        figures[rank * _AHEAD_MM + off_mm] = html.figure(picture, caption)
     worst = sorted(figures, reverse=True)[:_PICTURES_LIMIT]
     yield html.side_by_side("views", (figures[rank] for rank in worst))
     if len(figures) > len(worst):

@@ -30,6 +30,7 @@ function behind(element) {
 }
 document.querySelectorAll("details").forEach(part => part.open = true);
 const told = {wide: document.documentElement.scrollWidth, contrast: {}};
+told.paper = light(behind(document.body));
 const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
 while (walker.nextNode()) {
   const text = walker.currentNode, parent = text.parentElement, style = getComputedStyle(parent);
@@ -69,13 +70,21 @@ def test_it_is_small_and_prints_on_one_page(report: Path) -> None:
     assert len(re.findall(rb"/Type\s*/Page\b", printed.read_bytes())) == PAGES
 
 
-def test_all_text_has_the_contrast_that_eyes_need_and_none_is_beside_a_phones_screen(report: Path) -> None:
+DARK = "--blink-settings=preferredColorScheme=0"
+"""Tells pages that the person prefers a dark screen."""
+
+
+@pytest.mark.parametrize("scheme", [(), (DARK,)])
+def test_all_text_has_the_contrast_that_eyes_need_and_none_is_beside_a_phones_screen(
+    report: Path, scheme: tuple[str, ...]
+) -> None:
     measured = report.with_name("measured.html")
     measured.write_text(report.read_text().replace("</body>", f"{MEASURE}</body>"))
-    shown = chromium(measured, f"--window-size={PHONE_PX},900", "--dump-dom")
+    shown = chromium(measured, f"--window-size={PHONE_PX},900", "--dump-dom", *scheme)
     found = re.search(r'id="told">(.*?)</pre>', shown, re.DOTALL)
     assert found
     told: dict[str, Any] = json.loads(html.unescape(found[1]))
     assert len(told["contrast"]) > 50
     assert {text: ratio for text, ratio in told["contrast"].items() if ratio < AA} == {}
     assert told["wide"] <= PHONE_PX
+    assert (told["paper"] < 0.1) == bool(scheme)

@@ -139,9 +139,16 @@ def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Record
     page, largest_px = report_page(job), max(job.solution.evidence.rms_px.values())
     assert loaded.without_board[0].reason in page
     assert page.count(" px</title></rect>") == 6
-    assert re.search(rf'class="largest" \S+ y="0" \S+ height="{largest_px:.4g}"', page)
+    assert re.search(rf'y="0" \S+ height="{largest_px:.4g}"', page)
     near, far = (html.bars({0: 1.0, 2: 0.5}, "px", limit) for limit in (3.0, 4.0))
     assert 'class="limit"' in near and 'class="limit"' not in far
+
+
+def test_a_bar_has_another_colour_only_where_it_is_over_the_limit() -> None:
+    values = {0: 1.0, 2: 3.5, 3: 4.0}
+    assert html.bars(values, "px", 3.0).count('class="over"') == 2
+    assert html.bars(values, "px", 5.0).count('class="over"') == 0
+    assert html.bars(values, "px").count('class="over"') == 0
 
 
 def test_leaving_out_a_view_that_shows_no_board_is_fine(source: Recording, tmp_path: Path) -> None:

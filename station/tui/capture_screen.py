@@ -20,7 +20,7 @@ from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 
 BACK = "Backspace takes the last view back"
-ERROR_LEGEND = "after each pose: █ by images  : planned"
+ERROR_LEGEND = "mm, log axis, by pose: █ by images  : planned"
 
 
 class CaptureScreen(StationScreen):

@@ -16,7 +16,7 @@ from station.cell.status import (
 from station.protocol import verbs
 from station.tui.app import StationApp
 from station.tui.task import Known, next_action
-from station.tui.widgets.preview import PreviewPane
+from station.tui.widgets.preview import YELLOW, PreviewPane
 from tests.tui.conftest import CELL, FakeLink, app_on, idle, in_session, until, with_robot
 
 OUTLINE = ((0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
@@ -33,7 +33,9 @@ def by_hand(views: int, **guidance: object) -> StationStatus:
 
 
 def outlined(pane: PreviewPane) -> int:
-    return sum(pane.render_line(row).text.count("o") for row in range(pane.size.height))
+    """How many cells show the wanted view's outline."""
+    parts = [part for row in range(pane.size.height) for part in pane.render_line(row)]
+    return sum(len(part.text) for part in parts if part.style is not None and part.style.color == YELLOW)
 
 
 def footer(app: StationApp) -> dict[str, str]:

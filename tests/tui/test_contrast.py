@@ -47,4 +47,8 @@ def test_the_pages_words() -> None:
         pairs += [(c["text"], c["panel"]), (c["on"], c["now"]), (c["on"], c["look"])]
         assert all(ratio(*pair) >= 4.5 for pair in pairs)
     css = Path(report.__file__).with_name("report.css").read_text()
-    assert all(ratio(colour, "#fff") >= 4.5 for colour in re.findall(r"--(?!line)\w+: (#\w{6})", css))
+    light, dark = (dict(re.findall(r"--([\w-]+): (#\w{6})", scheme)) for scheme in css.split("@media")[:2])
+    for colours in (light, dark):
+        words = [colours[word] for word in ("ink", "good", "bad", "warn", "soft")]
+        assert all(ratio(word, colours["paper"]) >= 4.5 for word in words)
+    assert all(ratio("#ffffff", light[back]) >= 4.5 for back in ("good-back", "bad-back"))

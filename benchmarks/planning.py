@@ -128,7 +128,8 @@ def _plan_and_check(cell: RandomCell, result: CellResult, rng: np.random.Generat
     flange = forward(ARM, joints[1:])
     result.unseen += sum(not shows_board(cell.camera_from_board(E)) for E in flange)
     check_plan(plan, cell.start, scene.geometry)
-    last_m, distance_m = plan.poses[-1].predicted_sigma_m, plan.working_distance_m
+    last_m = plan.poses[-1].predicted_sigma_m
+    distance_m = plan.working_distance_m
     assert last_m is not None and plan.floor_m is not None and distance_m is not None
     by_x_m = np.sqrt(last_m**2 - plan.floor_m**2)
     errors = np.array([x_error(cell, flange, rng) for _ in range(2 * VISITS)])

@@ -150,7 +150,8 @@ def excluded_text(calibration: Calibration) -> str:
 
 def held_out_text(calibration: Calibration) -> str:
     """Write the held-out error without and with the views that a person excluded; empty where not known."""
-    held, excluded = calibration.quality.holdout, calibration.excluded
+    held = calibration.quality.holdout
+    excluded = calibration.excluded
     if held is None or excluded is None or excluded.all_views.holdout_m is None:
         return ""
     return (
@@ -165,7 +166,8 @@ def exclusion_sentences(calibration: Calibration) -> Iterator[str]:
         return
     poses = ", ".join(str(index + 1) for index in excluded.views)
     yield f"Excluded by {excluded.who}: pose {poses}."
-    all_views, quality = excluded.all_views, calibration.quality
+    all_views = excluded.all_views
+    quality = calibration.quality
     if all_views.problem:
         yield f"All views together give no result: {all_views.problem}"
         return

@@ -59,6 +59,11 @@ class KnownErrors:
     freedom: float
     """Degrees of freedom of the noise's estimate: the fewer, the heavier the tail."""
 
+    @classmethod
+    def exact(cls, X: Array, count: int) -> KnownErrors:
+        """Know X (4, 4), and that `count` errors are 0, with no noise: to linearise there."""
+        return cls(X, np.zeros(count), np.zeros((6 + count, 6 + count)), np.zeros(2), 1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedPoint:
@@ -171,7 +176,7 @@ class PointPrediction:
         postures = Postures(base_from_flange, none if by_arm_errors is None else by_arm_errors, none)
         count = postures.by_arm.shape[2]
         robot = np.array([noise.robot_m, noise.robot_rad])
-        exact = KnownErrors(X, np.zeros(count), np.zeros((6 + count, 6 + count)), robot, 1.0)
+        exact = KnownErrors.exact(X, count)
         return cls(PlacedPoint.of(mount, exact, X, on_axis(distance_m), postures), robot)
 
     def error_m(self, covariance: Array) -> float:

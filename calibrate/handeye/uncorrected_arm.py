@@ -48,7 +48,7 @@ def best_change_of_X(
     from the camera.
     """
     count = recorded.by_arm.shape[2] + recorded.by_bracket.shape[2]
-    exact = KnownErrors(X, np.zeros(count), np.zeros((6 + count, 6 + count)), np.zeros(2), 1.0)
+    exact = KnownErrors.exact(X, count)
     square = np.zeros((6 + count, 6 + count))
     for x, y in _DIRECTIONS:
         point = distance_m * np.array([x, y, 1.0])

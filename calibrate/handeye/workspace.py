@@ -35,10 +35,11 @@ def sample_workspace(model: RobotModel, like_rad: Array, count: int = 400) -> Ar
     return np.asarray(found[:count])
 
 
-def sample_range(joints_rad: Array, count: int = 400, seed: int = 0) -> Array:
+def sample_range(joints_rad: Array, count: int) -> Array:
     """Draw joints (count, k) uniformly from the range of each joint in `joints_rad` (n, k). Deterministic."""
-    low, high = joints_rad.min(axis=0), joints_rad.max(axis=0)
-    return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+    low = joints_rad.min(axis=0)
+    high = joints_rad.max(axis=0)
+    return np.random.default_rng(0).uniform(low, high, (count, len(low)))
 
 
 _MOST_ROUNDS = 20

@@ -245,7 +245,8 @@ def _all_views(
         solution, gates = _judged(everything, with_all)
     except CalibrationError as problem:
         return AllViews(problem=str(problem))
-    figures, evidence = solution.judgement.figures, solution.evidence
+    figures = solution.judgement.figures
+    evidence = solution.evidence
     excluded = {number - 1 for number in options.without}
     X, _ = solution.fit.installed
     return AllViews(

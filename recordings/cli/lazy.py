@@ -69,7 +69,8 @@ class LazyGroup(TyperGroup):
         environment: Mapping[str, str],
     ) -> None:
         """`files`, `environment`: what the manual page and docs/reference/cli.md say of each, by its name."""
-        self.files, self.environment = files, environment
+        self.files = files
+        self.environment = environment
         super().__init__(
             commands={name: TyperCommand(name, help=command.line) for name, command in commands.items()},
             help=help,

@@ -119,7 +119,7 @@ def arm_objective(layout: CellLayout, free_intrinsics: bool, joints_rad: Array) 
     by_links = chain.by_links(room)
     count = by_links.shape[2]
     elsewhere = Postures(chain.forward(room), by_links, np.zeros((len(room), 6, 0)))
-    exact = KnownErrors(layout.X, np.zeros(count), np.zeros((6 + count, 6 + count)), np.zeros(2), 1.0)
+    exact = KnownErrors.exact(layout.X, count)
     point = on_axis(layout.working_distance_m)
     tool_m = farthest_tool_m(layout.mount, layout.X, point, chain.forward(joints_rad))
     placed = PlacedPoint.of(layout.mount, exact, layout.X, point, elsewhere, tool_m)

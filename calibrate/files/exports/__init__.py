@@ -25,7 +25,8 @@ def export(
     """
     if name not in FORMATS:
         raise UsageError("export-format", format=name, known=", ".join(FORMATS))
-    form, frames = FORMATS[name], frames or FrameNames()
+    form = FORMATS[name]
+    frames = frames or FrameNames()
     _require_use(name, form.frames, frames)
     if arm is not None:
         if name != "urdf":
